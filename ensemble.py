@@ -1,0 +1,235 @@
+"""The ensemble of Figure 1(a): K actors on one shared trunk, K critics on another, trained by DDPG.
+
+Letters in the shape comments:
+    K heads    B transitions    E rows for each head    I inputs
+    O observation    G goal    A action    H = 256 units of a hidden layer
+
+Nothing here knows about priorities: a mini-batch comes in with a weight for each transition, and
+the variance of the Q-values goes out. The prioritisation is in vcp.py.
+"""
+
+import numpy as np
+import torch
+
+HIDDEN = 256  # Appendix B
+
+
+def linear(x: torch.Tensor, w: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """x·w + b, for one layer (B, I)·(I, J) or for a stack of K layers (..., I)·(K, I, J)."""
+    return torch.addmm(b, x, w) if x.ndim == w.ndim == 2 else x @ w + b
+
+
+class MultiHeadMLP:
+    """Figure 1(a) and Appendix B: a trunk of two layers that all heads share, then, for each head,
+    one more layer of 256 units and an output.
+
+    `squash` is applied where the trunk ends and to the output: torch.tanh for the actor, None for
+    the critic (not in the paper: the released code leaves its trunks this way, without a ReLU).
+
+    The heads are stacked along a first axis, so one call evaluates all of them, and `head(k)` is a
+    list of views into the same memory, so training head k changes exactly its slice and the trunk.
+    """
+
+    def __init__(self, inputs, outputs, heads, squash, generator, device="cpu"):
+        def xavier(*shape):  # U(-√(6/(I+J)), √(6/(I+J)))
+            bound = (6 / (shape[-2] + shape[-1])) ** 0.5
+            return ((2 * torch.rand(*shape, generator=generator) - 1) * bound).to(device)
+
+        def zeros(*shape):
+            return torch.zeros(*shape, device=device)
+
+        self.squash = squash or (lambda x: x)
+        self.trunk = [xavier(inputs, HIDDEN), zeros(1, HIDDEN), xavier(HIDDEN, HIDDEN)]
+        self.trunk += [zeros(1, HIDDEN)]
+        self.heads = [xavier(heads, HIDDEN, HIDDEN), zeros(heads, 1, HIDDEN)]
+        self.heads += [xavier(heads, HIDDEN, outputs), zeros(heads, 1, outputs)]
+        self._head = [[*self.trunk, *(p[k] for p in self.heads)] for k in range(heads)]
+
+    def head(self, k: int) -> list[torch.Tensor]:
+        """The eight tensors of head k's network: the shared trunk's four, then its own four."""
+        return self._head[k]
+
+    def forward(self, params: list[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
+        """The network with the tensors `params`: `head(k)` maps (B, I) to (B, J)."""
+        w1, b1, w2, b2, w3, b3, w4, b4 = params
+        h = torch.relu(linear(x, w1, b1))
+        h = self.squash(linear(h, w2, b2))  # what Figure 1(a) calls the embedding
+        h = torch.relu(linear(h, w3, b3))
+        return self.squash(linear(h, w4, b4))
+
+    def forward_heads(self, x: torch.Tensor, heads: slice = slice(None)) -> torch.Tensor:
+        """The chosen heads in one call. x is (K, E, I), rows of their own for each head, or (B, I),
+        the same rows for all; gives (K, E, J) or (K, B, J)."""
+        return self.forward([*self.trunk, *(p[heads] for p in self.heads)], x)
+
+
+class Normalizer:
+    """Running mean and standard deviation of [observation | goal], as HER's published code has it
+    (not in the paper): clip to ±200, standardise (std at least 0.01), clip to ±5."""
+
+    def __init__(self, dim: int, device="cpu"):
+        self.count = 0
+        self.sum = np.zeros(dim)  # float64: the sums run over millions of rows
+        self.sum_of_squares = np.zeros(dim)
+        self.mean = torch.zeros(dim, device=device)
+        self.std = torch.ones(dim, device=device)
+
+    def update(self, x: np.ndarray) -> None:
+        """Add the rows of x, (B, dim), to the statistics."""
+        x = np.clip(np.asarray(x, dtype=np.float64), -200, 200)
+        self.count += len(x)
+        self.sum += x.sum(axis=0)
+        self.sum_of_squares += np.square(x).sum(axis=0)
+        mean = self.sum / self.count
+        variance = self.sum_of_squares / self.count - mean**2
+        self.mean.copy_(torch.from_numpy(mean))
+        self.std.copy_(torch.from_numpy(np.sqrt(np.maximum(variance, 0.01**2))))
+
+    def __call__(self, x: torch.Tensor) -> torch.Tensor:
+        return ((x.clamp(-200, 200) - self.mean) / self.std).clamp(-5, 5)
+
+
+class EnsembleDDPG:
+    """DDPG with K heads, Section 4.1: head k has its own actor, critic, target actor, target critic
+    and optimiser state, and is trained on mini-batches of its own (Algorithm 2, lines 14-17).
+
+    All methods take and give NumPy arrays; actions are in [-1, 1].
+    gamma: discount (the paper does not say; 1 - 1/T for episodes of T steps).
+    polyak: share of the old target kept in `update_targets` (Appendix B: 0.95).
+    action_penalty: weight of mean(μ²) in the actor's loss (not in the paper; 1 in HER's code).
+    """
+
+    def __init__(
+        self,
+        obs_dim: int,
+        goal_dim: int,
+        action_dim: int,
+        *,
+        gamma: float,
+        heads: int = 16,
+        learning_rate: float = 1e-3,
+        polyak: float = 0.95,
+        action_penalty: float = 1.0,
+        device: str = "cpu",
+        seed: int = 0,
+    ):
+        self.gamma, self.polyak, self.action_penalty = gamma, polyak, action_penalty
+        self.device = torch.device(device)
+        generator = torch.Generator().manual_seed(seed)
+        state = obs_dim + goal_dim
+
+        def actor():
+            return MultiHeadMLP(state, action_dim, heads, torch.tanh, generator, device)
+
+        def critic():
+            return MultiHeadMLP(state + action_dim, 1, heads, None, generator, device)
+
+        self.actor, self.critic = actor(), critic()
+        self.target_actor, self.target_critic = actor(), critic()
+        self._move_targets(trunk_step=1.0, head_step=1.0)  # targets start as copies
+        self.normalizer = Normalizer(state, device)
+        # One Adam for each head and network: it holds the moments of the head's own tensors AND
+        # this head's own moments of the shared trunk.
+        self.actor_optimizers, self.critic_optimizers = (
+            [
+                torch.optim.Adam(
+                    [p.requires_grad_() for p in net.head(k)], learning_rate, fused=True
+                )
+                for k in range(heads)
+            ]
+            for net in (self.actor, self.critic)
+        )
+
+    # ---------------------------------------------------------------- acting and scoring
+
+    @torch.no_grad()
+    def act(self, obs: np.ndarray, goal: np.ndarray, heads: slice = slice(None)) -> np.ndarray:
+        """Algorithm 2, line 7, without noise: a = μ_k(s, g) for all heads in one call.
+        obs (K, E, O) and goal (K, E, G) -> (K, E, A); `heads` picks which K heads act."""
+        return self.actor.forward_heads(self._state(obs, goal), heads).cpu().numpy()
+
+    @torch.no_grad()
+    def value(self, obs: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Q_k(s, μ_k(s, g), g), what head k expects of its own policy. (K, E, ...) -> (K, E)."""
+        state = self._state(obs, goal)
+        q = self.critic.forward_heads(torch.cat([state, self.actor.forward_heads(state)], -1))
+        return q.squeeze(-1).cpu().numpy()
+
+    @torch.no_grad()
+    def q_variance(self, obs: np.ndarray, action: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Section 4.2: σ² over the K critics of Q_k(s, a, g), the variance that Eq. (4) turns into
+        a priority: the biased one, 1/K Σ_k (Q_k - mean)². (B, O), (B, A), (B, G) -> (B,)."""
+        state_action = torch.cat([self._state(obs, goal), self._tensor(action)], -1)
+        q = self.critic.forward_heads(state_action).squeeze(-1)  # (K, B)
+        return q.var(dim=0, correction=0).cpu().numpy()
+
+    # ---------------------------------------------------------------- learning
+
+    def update_head(self, k: int, batch: dict[str, np.ndarray]) -> torch.Tensor:
+        """Algorithm 2, line 16: one DDPG step of head k, Eqs. (2) and (3), conditioned on goals.
+
+        batch: obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,) and weight (B,).
+        It moves head k and both trunks, no other head. Both gradients are taken before either
+        step. There is no terminal state: episodes have a fixed length. Gives (2,), the losses of
+        critic and actor.
+        """
+        state = self._state(batch["obs"], batch["goal"])  # (B, O+G)
+        next_state = self._state(batch["next_obs"], batch["goal"])
+        action = self._tensor(batch["action"])
+        reward = self._tensor(batch["reward"])[:, None]  # (B, 1)
+        weight = self._tensor(batch["weight"])[:, None]
+        critic, actor = self.critic.head(k), self.actor.head(k)
+
+        with torch.no_grad():  # y = r + γ Q̄_k(s', μ̄_k(s', g), g), head k's own targets
+            next_action = self.target_actor.forward(self.target_actor.head(k), next_state)
+            next_q = self.target_critic.forward(
+                self.target_critic.head(k), torch.cat([next_state, next_action], 1)
+            )
+            # Rewards are -1 or 0, so every return lies in [-1/(1-γ), 0].
+            target = (reward + self.gamma * next_q).clamp(-1 / (1 - self.gamma), 0)
+
+        # Eq. (2): L(φ_k) = E[w (Q_k(s, a, g) - y)²]
+        q = self.critic.forward(critic, torch.cat([state, action], 1))
+        critic_loss = (weight * (q - target).square()).mean()
+
+        # Eq. (3): maximise E[w Q_k(s, μ_k(s, g), g)], with a penalty on large actions
+        policy = self.actor.forward(actor, state)
+        policy_q = self.critic.forward(critic, torch.cat([state, policy], 1))
+        actor_loss = -(weight * policy_q).mean()
+        actor_loss = actor_loss + self.action_penalty * (weight * policy.square()).mean()
+
+        critic_grads = torch.autograd.grad(critic_loss, critic)
+        actor_grads = torch.autograd.grad(actor_loss, actor)
+        for params, grads, optimizer in (
+            (critic, critic_grads, self.critic_optimizers[k]),
+            (actor, actor_grads, self.actor_optimizers[k]),
+        ):
+            for param, grad in zip(params, grads, strict=True):
+                param.grad = grad
+            optimizer.step()
+        return torch.stack([critic_loss, actor_loss]).detach()
+
+    def update_targets(self) -> None:
+        """θ̄ <- polyak·θ̄ + (1 - polyak)·θ, once a cycle FOR EACH HEAD's target network.
+
+        A head's network is its head and the trunk, so the trunk is averaged K times; the main trunk
+        stands still meanwhile, and K steps of 0.95 are one step of 0.95^K. With a single step for
+        the trunk learning is several times slower (NOTES.md, "the trunk's targets").
+        """
+        heads = len(self.actor_optimizers)
+        self._move_targets(trunk_step=1 - self.polyak**heads, head_step=1 - self.polyak)
+
+    @torch.no_grad()
+    def _move_targets(self, trunk_step: float, head_step: float) -> None:
+        for target, net in ((self.target_actor, self.actor), (self.target_critic, self.critic)):
+            torch._foreach_lerp_(target.trunk, net.trunk, trunk_step)
+            torch._foreach_lerp_(target.heads, net.heads, head_step)
+
+    # ---------------------------------------------------------------- NumPy to network
+
+    def _tensor(self, x: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(x, dtype=torch.float32, device=self.device)
+
+    def _state(self, obs: np.ndarray, goal: np.ndarray) -> torch.Tensor:
+        """The networks' input: [observation | goal], normalised."""
+        return self.normalizer(torch.cat([self._tensor(obs), self._tensor(goal)], -1))

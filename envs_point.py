@@ -1,0 +1,327 @@
+"""The environments of Appendix A: PointMass and the sparse Reacher, and `make_env`, which knows the
+paper's sixteen names and takes any other goal environment.
+
+Goal environments: the observation is a dict of "observation", "achieved_goal" and "desired_goal",
+and `compute_reward(achieved, desired, info)` is Eq. (1): 0 where the goal is reached, else -1.
+Lengths are in metres; an episode of the paper's has 50 steps.
+"""
+
+import contextlib
+import difflib
+import io
+import math
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco.reacher_v5 import ReacherEnv
+from gymnasium.spaces import Box
+
+with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice about other environments
+    import gymnasium_robotics
+gym.register_envs(gymnasium_robotics)
+
+
+class UsageError(ValueError):
+    """What was asked for cannot be done. run.py prints it as one line and exits with code 2."""
+
+
+def goal_space(obs_dim: int, goal_dim: int, bound: float = np.inf) -> gym.spaces.Dict:
+    """The observation space of a goal environment, float64, all entries within ±bound."""
+    goal = Box(-bound, bound, (goal_dim,), np.float64)
+    observation = Box(-bound, bound, (obs_dim,), np.float64)
+    return gym.spaces.Dict(
+        {"observation": observation, "achieved_goal": goal, "desired_goal": goal}
+    )
+
+
+def sparse_reward(achieved: np.ndarray, desired: np.ndarray, threshold: float) -> np.ndarray:
+    """Eq. (1): r = [ψ(s) == g] - 1, where "==" means within `threshold`. (..., G) -> (...)."""
+    distance = np.sqrt(np.square(achieved - desired).sum(axis=-1))
+    return (distance <= threshold).astype(np.float32) - 1
+
+
+# -------------------------------------------------------------------------------- PointMass
+
+ROOM = 0.6  # the room is [-0.6, 0.6]²
+RADIUS = 0.05  # of the circle that is moved
+REACH = ROOM - RADIUS  # as far out as the circle's centre gets
+STEP = 0.05  # moved per unit of action, in each axis
+WALL_END, WALL_RADIUS = 0.2, 0.03  # the wall: all points within 0.03 of x <= 0.2, y = 0
+CLEARANCE = WALL_RADIUS + RADIUS  # the circle's centre stays this far from the wall's axis
+
+
+def inside_wall(x: float, y: float) -> bool:
+    """Whether a circle centred at (x, y) overlaps the wall (touching is not overlapping)."""
+    return math.hypot(max(x - WALL_END, 0.0), y) < CLEARANCE
+
+
+def slide_along_wall(x: float, y: float, to_x: float, to_y: float) -> tuple[float, float]:
+    """Where the centre gets from (x, y) towards (to_x, to_y): up to the wall, then along it.
+
+    For the centre, the wall is a strip of half-width CLEARANCE with a round end. It is convex, so
+    what is left of the move after the first contact, with the part that points into the wall taken
+    out, cannot enter it again. The path is solved for, not sampled, so nothing tunnels.
+    """
+    dx, dy = to_x - x, to_y - y
+    side = 1.0 if y > 0 else -1.0
+    if side * y >= CLEARANCE > side * to_y:  # crosses the line of the strip's flat face
+        s = (side * CLEARANCE - y) / dy
+        if x + s * dx <= WALL_END:
+            return to_x, side * CLEARANCE
+    # The round end: the smaller root of |(x, y) + s·(dx, dy) - end|² = CLEARANCE²
+    ex, ey = x - WALL_END, y
+    a = dx * dx + dy * dy
+    b = ex * dx + ey * dy
+    discriminant = b * b - a * (ex * ex + ey * ey - CLEARANCE**2)
+    if b >= 0 or discriminant <= 0:  # moves away, or passes by
+        return to_x, to_y
+    s = (-b - math.sqrt(discriminant)) / a
+    if s > 1:
+        return to_x, to_y
+    s = max(s, 0.0)
+    nx, ny = (ex + s * dx) / CLEARANCE, (ey + s * dy) / CLEARANCE  # the normal at the contact
+    into = (1 - s) * min(dx * nx + dy * ny, 0.0)
+    return to_x - into * nx, to_y - into * ny
+
+
+class PointMass(gym.Env):
+    """PointMassEmptyEnv-v1 and PointMassWallEnv-v1: a circle in a walled room moves to a point.
+
+    Appendix A: observation and achieved goal are the circle's centre (x, y), the goal is the point,
+    the action is the distance moved, 0.05 per unit in each axis. Success within 0.05. Start and
+    goal are uniform over the places where the circle's centre can be. The paper's is a MuJoCo model
+    with next to no inertia; this one has none, and needs no MuJoCo.
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 20}
+    threshold = 0.05
+
+    def __init__(self, wall: bool = False, render_mode: str | None = None):
+        self.wall, self.render_mode = wall, render_mode
+        self.observation_space = goal_space(2, 2, bound=ROOM)
+        self.action_space = Box(-1, 1, (2,), np.float32)
+        self._xy = self._goal = (0.0, 0.0)
+        self._image = None
+
+    def compute_reward(self, achieved_goal, desired_goal, info) -> np.ndarray:
+        """Eq. (1). (..., 2) and (..., 2) -> (...), 0 within 0.05 of the goal, else -1."""
+        return sparse_reward(achieved_goal, desired_goal, self.threshold)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._xy, self._goal = self._free_place(), self._free_place()
+        if self.render_mode == "human":
+            self.render()
+        return self._observe(), {}
+
+    def step(self, action):
+        # Plain floats: NumPy's cost on two numbers is most of a step's time.
+        x, y = self._xy
+        to_x = x + STEP * min(max(float(action[0]), -1.0), 1.0)
+        to_y = y + STEP * min(max(float(action[1]), -1.0), 1.0)
+        to_x = min(max(to_x, -REACH), REACH)  # the room's walls: slides along
+        to_y = min(max(to_y, -REACH), REACH)
+        self._xy = slide_along_wall(x, y, to_x, to_y) if self.wall else (to_x, to_y)
+        dx, dy = self._xy[0] - self._goal[0], self._xy[1] - self._goal[1]
+        success = math.sqrt(dx * dx + dy * dy) <= self.threshold
+        if self.render_mode == "human":
+            self.render()
+        return self._observe(), float(success) - 1, False, False, {"is_success": success}
+
+    def render(self) -> np.ndarray | None:
+        """A picture of the room, (240, 240, 3) uint8; in mode "human", a window instead."""
+        picture = self._draw(240)
+        if self.render_mode != "human":
+            return picture
+        import matplotlib.pyplot as plt
+
+        if self._image is None:
+            self._image = plt.subplots()[1].imshow(picture)
+            self._image.axes.axis("off")
+        self._image.set_data(picture)
+        plt.pause(1 / self.metadata["render_fps"])
+
+    def close(self):
+        if self._image is not None:
+            import matplotlib.pyplot as plt
+
+            plt.close(self._image.figure)
+            self._image = None
+
+    def _free_place(self) -> tuple[float, float]:
+        while True:
+            x, y = self.np_random.uniform(-REACH, REACH, size=2).tolist()
+            if not (self.wall and inside_wall(x, y)):
+                return x, y
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        return {
+            "observation": np.array(self._xy),
+            "achieved_goal": np.array(self._xy),
+            "desired_goal": np.array(self._goal),
+        }
+
+    def _draw(self, pixels: int) -> np.ndarray:
+        edge = ROOM + 2 * WALL_RADIUS
+        x, y = np.meshgrid(*2 * [(np.arange(pixels) + 0.5) / pixels * 2 * edge - edge])
+        y = -y  # pictures start at the top
+        picture = np.full((pixels, pixels, 3), 255, np.uint8)
+        picture[np.maximum(abs(x), abs(y)) > ROOM] = (90, 90, 90)
+        if self.wall:
+            picture[np.hypot(np.maximum(x - WALL_END, 0), y) < WALL_RADIUS] = (90, 90, 90)
+        for (cx, cy), radius, colour in (
+            (self._xy, RADIUS, (0, 114, 178)),
+            (self._goal, 0.02, (213, 94, 0)),
+        ):
+            picture[np.hypot(x - cx, y - cy) < radius] = colour
+        return picture
+
+
+# -------------------------------------------------------------------------------- Reacher
+
+
+class SparseReacher(ReacherEnv):
+    """Reacher-v2 of the paper: MuJoCo's Reacher with a goal and the sparse reward of Eq. (1).
+
+    Appendix A: the state is 8 numbers, cos and sin of the two joint angles, position and velocity
+    of the fingertip in x and y; the goal is the target's x and y. Success within 0.02.
+    velocity: "fingertip" (the paper's text) or "joints" (the released code: two joint velocities
+    stand where the text has the fingertip's).
+    """
+
+    def __init__(self, velocity: str = "fingertip", **kwargs):
+        if velocity not in ("fingertip", "joints"):
+            raise ValueError(f"velocity must be 'fingertip' or 'joints', not {velocity!r}")
+        self.velocity, self.threshold = velocity, 0.02
+        super().__init__(**kwargs)
+        self.observation_space = goal_space(8, 2)
+
+    def compute_reward(self, achieved_goal, desired_goal, info) -> np.ndarray:
+        """Eq. (1). (..., 2) and (..., 2) -> (...), 0 within 0.02 of the goal, else -1."""
+        return sparse_reward(achieved_goal, desired_goal, self.threshold)
+
+    def step(self, action):
+        obs, _, terminated, truncated, _ = super().step(action)
+        reward = float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {}))
+        return obs, reward, terminated, truncated, {"is_success": reward == 0}
+
+    def _get_obs(self):
+        angles, fingertip = self.data.qpos[:2], self.get_body_com("fingertip")[:2].copy()
+        velocity = (
+            self._fingertip_velocity() if self.velocity == "fingertip" else self.data.qvel[:2]
+        )
+        return {
+            "observation": np.concatenate([np.cos(angles), np.sin(angles), fingertip, velocity]),
+            "achieved_goal": fingertip,
+            "desired_goal": self.get_body_com("target")[:2].copy(),
+        }
+
+    def _fingertip_velocity(self) -> np.ndarray:
+        spatial = np.empty(6)  # angular, then linear, along the world's axes
+        body = self.model.body("fingertip").id
+        mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_XBODY, body, spatial, 0)
+        return spatial[3:5]
+
+
+# -------------------------------------------------------------------------------- names
+
+gym.register("PointMassEmptyEnv-v1", PointMass, max_episode_steps=50)
+gym.register("PointMassWallEnv-v1", PointMass, max_episode_steps=50, kwargs={"wall": True})
+gym.register("SparseReacher-v1", SparseReacher, max_episode_steps=50)
+
+PAPER_LENGTH = 50  # T, for all sixteen; today's Hand manipulation tasks stop at 100 by themselves
+PAPER_ENVS = {  # the paper's name -> today's id
+    "FetchReach-v1": "FetchReach-v4",
+    "FetchPush-v1": "FetchPush-v4",
+    "FetchSlide-v1": "FetchSlide-v4",
+    "FetchPickAndPlace-v1": "FetchPickAndPlace-v4",
+    "HandReach-v0": "HandReach-v3",
+    "HandManipulatePenFull-v0": "HandManipulatePenFull-v1",
+    "HandManipulatePenRotate-v0": "HandManipulatePenRotate-v1",
+    "HandManipulateEggFull-v0": "HandManipulateEggFull-v1",
+    "HandManipulateEggRotate-v0": "HandManipulateEggRotate-v1",
+    "HandManipulateBlockFull-v0": "HandManipulateBlockFull-v1",
+    "HandManipulateBlockRotateParallel-v0": "HandManipulateBlockRotateParallel-v1",
+    "HandManipulateBlockRotateXYZ-v0": "HandManipulateBlockRotateXYZ-v1",
+    "HandManipulateBlockRotateZ-v0": "HandManipulateBlockRotateZ-v1",
+    "Reacher-v2": "SparseReacher-v1",
+    "PointMassEmptyEnv-v1": "PointMassEmptyEnv-v1",
+    "PointMassWallEnv-v1": "PointMassWallEnv-v1",
+}
+MISSPELT = {  # as Appendix A prints two of them
+    "FetchSilce-v1": "FetchSlide-v1",
+    "FetchPickAndPlac-v1": "FetchPickAndPlace-v1",
+}
+
+
+def describe(name: str) -> str:
+    """One line: which environment `make_env(name)` makes, and how it differs from the paper's."""
+    name = MISSPELT.get(name, name)
+    made = PAPER_ENVS.get(name, name)
+    if name not in PAPER_ENVS:
+        return f"{name}: not one of the paper's sixteen, made as it is"
+    if made.startswith("PointMass"):
+        difference = "our NumPy version of the paper's MuJoCo model, without inertia"
+    elif made.startswith("SparseReacher"):
+        difference = f"our sparse version of Reacher-v5, MuJoCo {mujoco.__version__}"
+    else:
+        difference = f"MuJoCo {mujoco.__version__}, so the physics differ a little from the paper's"
+    return f"{name}: made {made} ({difference}), {PAPER_LENGTH} steps an episode"
+
+
+def make_env(name: str, **kwargs) -> gym.Env:
+    """Make a goal environment by the paper's name, by a current id or as module:ID.
+
+    The paper's names get episodes of 50 steps, all others their own length; actions are rescaled to
+    [-1, 1]. kwargs go to the environment. UsageError, one line, for an unknown name and for what
+    this method cannot learn: no goals, no Box of actions, no vectorised `compute_reward` of -1 and
+    0, no fixed episode length.
+    """
+    name = MISSPELT.get(name, name)
+    length = PAPER_LENGTH if name in PAPER_ENVS else None
+    try:
+        env = gym.make(
+            PAPER_ENVS.get(name, name), max_episode_steps=length, disable_env_checker=True, **kwargs
+        )
+    except (gym.error.Error, ModuleNotFoundError) as error:
+        ids = [i for i, s in gym.registry.items() if "obotics" in str(s.entry_point)]
+        close = difflib.get_close_matches(name, {*PAPER_ENVS, *ids}, n=3, cutoff=0.5)
+        hint = f"; the nearest names are {', '.join(close)}" if close else ""
+        message = " ".join(str(error).split()).rstrip(".")
+        raise UsageError(f"cannot make the environment {name}: {message}{hint}") from error
+    problem = _what_is_missing(env)
+    if problem:
+        env.close()
+        raise UsageError(f"cannot learn in the environment {name}: {problem}")
+    if not (np.all(env.action_space.low == -1) and np.all(env.action_space.high == 1)):
+        env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+    return env
+
+
+def _what_is_missing(env: gym.Env) -> str | None:
+    keys = ("observation", "achieved_goal", "desired_goal")
+    space, action = env.observation_space, env.action_space
+    if not (isinstance(space, gym.spaces.Dict) and set(keys) <= set(space.keys())):
+        return f"it has no goals (its observation is not a dict of {', '.join(keys)})"
+    if not all(isinstance(space[k], Box) and len(space[k].shape) == 1 for k in keys):
+        return f"its {', '.join(keys)} are not all flat Boxes"
+    if not (isinstance(action, Box) and len(action.shape) == 1):
+        return f"its action space is {action}, not a flat Box"
+    if not action.is_bounded():
+        return f"its actions have no bounds ({action})"
+    if not callable(getattr(env.unwrapped, "compute_reward", None)):
+        return "it has no compute_reward(achieved_goal, desired_goal, info)"
+    if env.spec.max_episode_steps is None:
+        return "it has no episode length (register it with max_episode_steps)"
+    obs, _ = env.reset()
+    pairs = (
+        np.stack([obs["achieved_goal"]] * 3),
+        np.stack([obs["achieved_goal"], obs["desired_goal"], obs["desired_goal"]]),
+    )
+    rewards = np.asarray(env.unwrapped.compute_reward(*pairs, {}))
+    if rewards.shape != (3,):
+        return f"its compute_reward is not vectorised: 3 pairs of goals gave {rewards.shape}"
+    if rewards[0] != 0 or not np.isin(rewards, (-1, 0)).all():
+        return f"its rewards are not the -1 and 0 (reached) of Eq. (1), but {rewards[:2]}"
+    return None

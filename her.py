@@ -1,0 +1,86 @@
+"""Hindsight Experience Replay (Andrychowicz et al., 2017): the original buffer B_o and 'future'.
+
+Letters in the shape comments:
+    N episodes    T steps of an episode    B transitions    O observation    G goal    A action
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+Batch = dict[str, np.ndarray]
+RewardFn = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+class EpisodeBuffer:
+    """B_o of Figure 1(b): whole episodes of a fixed length T, with the goals they were played for.
+
+    episodes["obs"] (N, T+1, O), ["achieved_goal"] (N, T+1, G), ["desired_goal"] (N, G) and
+    ["action"] (N, T, A), float32. No reward is stored: Eq. (1) gives it when it is needed.
+    capacity: in transitions (Appendix B: 1e6); ValueError if it holds no whole episode.
+    """
+
+    def __init__(self, capacity: int, horizon: int, obs_dim: int, goal_dim: int, action_dim: int):
+        if capacity < horizon:
+            raise ValueError(f"a buffer of {capacity} transitions holds no episode of {horizon}")
+        self.capacity, self.size = capacity // horizon, 0  # in episodes
+        shapes = {
+            "obs": (horizon + 1, obs_dim),
+            "achieved_goal": (horizon + 1, goal_dim),
+            "desired_goal": (goal_dim,),
+            "action": (horizon, action_dim),
+        }
+        self._data = {k: np.empty((self.capacity, *s), np.float32) for k, s in shapes.items()}
+
+    @property
+    def episodes(self) -> dict[str, np.ndarray]:
+        """What is stored, as views: see the class for the shapes."""
+        return {name: array[: self.size] for name, array in self._data.items()}
+
+    def add(self, episodes: dict[str, np.ndarray], rng: np.random.Generator) -> None:
+        """Algorithm 2, line 9, for whole episodes. Once full, random old episodes make room (not in
+        the paper; HER's code does so). ValueError for more episodes than the buffer holds."""
+        new = len(episodes["action"])
+        if new > self.capacity:
+            raise ValueError(f"{new} episodes do not fit into a buffer of {self.capacity}")
+        free = min(new, self.capacity - self.size)
+        slots = np.arange(self.size, self.size + free)
+        if free < new:
+            overwritten = rng.choice(self.size, new - free, replace=False)
+            slots = np.concatenate([slots, overwritten])
+        for name, array in self._data.items():
+            array[slots] = episodes[name]
+        self.size += free
+
+
+def relabel_future(
+    episodes: dict[str, np.ndarray],
+    batch_size: int,
+    rng: np.random.Generator,
+    relabel_ratio: float,
+    reward_fn: RewardFn,
+) -> Batch:
+    """Section 3.2 and Algorithm 1, lines 3-4: draw transitions, replace goals by achieved ones.
+
+    episodes: arrays as in `EpisodeBuffer`.
+    relabel_ratio: probability that a transition gets a new goal. HER's k = 4 additional goals
+        (Appendix B) is the ratio k/(1+k) = 0.8; nothing is stored k times.
+    reward_fn: Eq. (1), vectorised: (B, G) achieved and (B, G) desired goals -> (B,) of -1 and 0.
+    Gives obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,), hindsight (B,) bool.
+    """
+    n, horizon = episodes["action"].shape[:2]
+    achieved = episodes["achieved_goal"]
+    e = rng.integers(n, size=batch_size)
+    t = rng.integers(horizon, size=batch_size)  # 0 .. T-1
+    hindsight = rng.random(batch_size) < relabel_ratio
+    future = rng.integers(t + 1, horizon + 1)  # t' ~ U{t+1, ..., T}, the same episode
+    goal = np.where(hindsight[:, None], achieved[e, future], episodes["desired_goal"][e])
+    return {
+        "obs": episodes["obs"][e, t],
+        "action": episodes["action"][e, t],
+        "next_obs": episodes["obs"][e, t + 1],  # with the same goal as obs
+        "goal": goal,
+        # r(s, a, g) asks whether the action led to the goal, so it reads the NEXT achieved goal.
+        "reward": np.asarray(reward_fn(achieved[e, t + 1], goal), dtype=np.float32),
+        "hindsight": hindsight,
+    }

@@ -1,0 +1,155 @@
+"""Value Consistency Prioritization, Section 4: what VCP adds to HER with an ensemble.
+
+`value_consistency_priority` is Eq. (4), `HERBuffer` is B_h with its priorities, and
+`update_her_buffer` is the body of Algorithm 1. These are the method; the rest is DDPG and HER.
+
+Letters in the shape comments:
+    N transitions in B_h    B transitions of a mini-batch
+"""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from ensemble import EnsembleDDPG
+from her import Batch, EpisodeBuffer, RewardFn, relabel_future
+
+
+def value_consistency_priority(
+    variance: np.ndarray, temperature: float, eps: float = 1e-6
+) -> np.ndarray:
+    """Eq. (4) and its normalisation: the probabilities to draw each transition of B_h.
+
+    variance: (N,), σ²_i over the critics; temperature: 𝒯; eps: ε. Gives (N,) float64, summing to 1.
+    ValueError unless there is at least one variance and all are finite.
+
+    The sum inside Eq. (4) is the same for all i, so normalising cancels it, and any other common
+    factor may stand in its place. Here it is the largest term: the ratios lie in (0, 1] and one of
+    them is 1, so their powers neither overflow nor all vanish, whatever 𝒯 and N are.
+    """
+    variance = np.asarray(variance, dtype=np.float64)
+    if not (variance.size and np.isfinite(variance).all()):
+        raise ValueError("Eq. (4) needs at least one variance, all of them finite")
+    consistency = variance.max() - variance + eps  # σ²_max - σ²_i + ε
+    priority = (consistency / consistency.max()) ** temperature  # p_i = (...)^𝒯
+    return priority / priority.sum()  # p_i / Σ p
+
+
+PRIORITIES = {  # Section 5.6: the method and its two ablations
+    "consistency": value_consistency_priority,
+    "variance": lambda variance, temperature: value_consistency_priority(-variance, temperature),
+    "uniform": lambda variance, temperature: np.full(len(variance), 1 / len(variance)),
+}
+
+IMPORTANCE = {  # the loss weight of a drawn transition; all are scaled to mean 1 in the mini-batch
+    "paper": lambda p: p,  # Section 4.3, literally: w_i = p_i / Σ p
+    "inverse": lambda p: 1 / p,  # Schaul et al. (2015b), β = 1: undoes the preference
+    "none": np.ones_like,
+}
+
+
+class HERBuffer:
+    """B_h of Figure 1(b): relabelled and original transitions, first in first out, each with the
+    variance it was scored with and the probability to be drawn.
+
+    capacity: in transitions (not in the paper; the released code takes what a cycle draws).
+    A stored variance is not refreshed: it is as old as the transition's stay in the buffer.
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        temperature: float,
+        priority: str = "consistency",
+        importance: str = "paper",
+    ):
+        self.capacity, self.temperature = capacity, temperature
+        self._priority, self._importance = PRIORITIES[priority], IMPORTANCE[importance]
+        self.size = self._next = 0
+        self.data: Batch = {}  # the batch's arrays with `capacity` rows, and "variance"
+        self.probabilities = self._cumulative = np.empty(0)  # (size,)
+        self._lock = threading.Lock()  # a row must not be read while it is half written
+
+    def add(self, batch: Batch, variance: np.ndarray) -> None:
+        """Algorithm 1, line 6: store the mini-batch over the oldest transitions.
+        Its arrays have B rows each, variance is (B,); ValueError if B exceeds the capacity."""
+        if len(variance) > self.capacity:
+            raise ValueError(f"{len(variance)} transitions do not fit into {self.capacity}")
+        batch = {**batch, "variance": variance}
+        if not self.data:
+            self.data = {
+                name: np.empty((self.capacity, *x.shape[1:]), x.dtype) for name, x in batch.items()
+            }
+        slots = (self._next + np.arange(len(variance))) % self.capacity
+        with self._lock:
+            for name, x in batch.items():
+                self.data[name][slots] = x
+        self._next = (self._next + len(variance)) % self.capacity
+        self.size = min(self.size + len(variance), self.capacity)
+
+    def update_priorities(self) -> None:
+        """Algorithm 1, line 7: Eq. (4) over all of B_h, from the stored variances. O(N)."""
+        probabilities = self._priority(self.data["variance"][: self.size], self.temperature)
+        cumulative = probabilities.cumsum()
+        with self._lock:
+            self.probabilities, self._cumulative = probabilities, cumulative / cumulative[-1]
+
+    def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
+        """Algorithm 2, line 15: draw with replacement by the normalised priorities, O(log N) each.
+        Gives the stored arrays' rows and "weight" (B,) float32, the factor of each in the loss."""
+        with self._lock:
+            # Inverse transform sampling: the first i with p_1 + ... + p_i > u.
+            i = np.searchsorted(self._cumulative, rng.random(batch_size), side="right")
+            batch = {name: x[i] for name, x in self.data.items()}
+            weight = self._importance(self.probabilities[i])
+        batch["weight"] = (weight / weight.mean()).astype(np.float32)
+        return batch
+
+
+def update_her_buffer(
+    original_buffer: EpisodeBuffer,
+    her_buffer: HERBuffer,
+    agent: EnsembleDDPG,
+    batch_size: int,
+    rng: np.random.Generator,
+    relabel_ratio: float,
+    reward_fn: RewardFn,
+) -> None:
+    """Algorithm 1, lines 3-7, once. `in_thread` is the loop around them."""
+    # 3-4: a mini-batch of B_o, its goals relabelled by 'future'
+    batch = relabel_future(original_buffer.episodes, batch_size, rng, relabel_ratio, reward_fn)
+    # 5: the variance of the K Q-values of each transition
+    variance = agent.q_variance(batch["obs"], batch["action"], batch["goal"])
+    her_buffer.add(batch, variance)  # 6
+    her_buffer.update_priorities()  # 7
+
+
+@contextmanager
+def in_thread(step: Callable[[], None]) -> Iterator[None]:
+    """Algorithm 1, lines 2 and 8, and Algorithm 2, line 13: call `step` over and over in another
+    thread while the block runs, and once before, so that the block finds something to draw. What
+    it raises is raised where the block ends.
+
+    How often it is called depends on the machine's load, so runs differ even with the same seed.
+    """
+    step()
+    stop, errors = threading.Event(), []
+
+    def loop():
+        try:
+            while not stop.is_set():
+                step()
+        except Exception as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=loop, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+    if errors:
+        raise errors[0]
