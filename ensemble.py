@@ -15,8 +15,11 @@ HIDDEN = 256  # Appendix B
 
 
 def linear(x: torch.Tensor, w: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """x·w + b, for one layer (B, I)·(I, J) or for a stack of K layers (..., I)·(K, I, J)."""
-    return torch.addmm(b, x, w) if x.ndim == w.ndim == 2 else x @ w + b
+    """w·x + b for one layer, w (J, I) and b (J,), or for a stack of K, w (K, J, I) and b (K, J).
+    x is (..., I) for one layer, (B, I) or (K, B, I) for a stack, which gives (K, B, J)."""
+    if w.ndim == 2:
+        return torch.nn.functional.linear(x, w, b)
+    return torch.baddbmm(b[:, None], x.expand(len(w), -1, -1), w.mT)
 
 
 class MultiHeadMLP:
@@ -32,17 +35,16 @@ class MultiHeadMLP:
 
     def __init__(self, inputs, outputs, heads, squash, generator, device="cpu"):
         def xavier(*shape):  # U(-√(6/(I+J)), √(6/(I+J)))
-            bound = (6 / (shape[-2] + shape[-1])) ** 0.5
-            return ((2 * torch.rand(*shape, generator=generator) - 1) * bound).to(device)
+            bound = (6 / (shape[-1] + shape[-2])) ** 0.5
+            return torch.empty(shape).uniform_(-bound, bound, generator=generator).to(device)
 
         def zeros(*shape):
-            return torch.zeros(*shape, device=device)
+            return torch.zeros(shape, device=device)
 
         self.squash = squash or (lambda x: x)
-        self.trunk = [xavier(inputs, HIDDEN), zeros(1, HIDDEN), xavier(HIDDEN, HIDDEN)]
-        self.trunk += [zeros(1, HIDDEN)]
-        self.heads = [xavier(heads, HIDDEN, HIDDEN), zeros(heads, 1, HIDDEN)]
-        self.heads += [xavier(heads, HIDDEN, outputs), zeros(heads, 1, outputs)]
+        self.trunk = [xavier(HIDDEN, inputs), zeros(HIDDEN), xavier(HIDDEN, HIDDEN), zeros(HIDDEN)]
+        self.heads = [xavier(heads, HIDDEN, HIDDEN), zeros(heads, HIDDEN)]
+        self.heads += [xavier(heads, outputs, HIDDEN), zeros(heads, outputs)]
         self._head = [[*self.trunk, *(p[k] for p in self.heads)] for k in range(heads)]
 
     def head(self, k: int) -> list[torch.Tensor]:
@@ -52,9 +54,9 @@ class MultiHeadMLP:
     def forward(self, params: list[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
         """The network with the tensors `params`: `head(k)` maps (B, I) to (B, J)."""
         w1, b1, w2, b2, w3, b3, w4, b4 = params
-        h = torch.relu(linear(x, w1, b1))
-        h = self.squash(linear(h, w2, b2))  # what Figure 1(a) calls the embedding
-        h = torch.relu(linear(h, w3, b3))
+        h = linear(x, w1, b1).relu_()  # in place: at this size a fresh array costs as much as it
+        h = self.squash(linear(h, w2, b2))  # the embedding of Figure 1(a)
+        h = linear(h, w3, b3).relu_()
         return self.squash(linear(h, w4, b4))
 
     def forward_heads(self, x: torch.Tensor, heads: slice = slice(None)) -> torch.Tensor:

@@ -207,6 +207,10 @@ class SparseReacher(ReacherEnv):
         return obs, reward, terminated, truncated, {"is_success": reward == 0}
 
     def _get_obs(self):
+        # mj_step leaves the bodies a substep behind the joints, here up to a centimetre.
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_comVel(self.model, self.data)
         angles, fingertip = self.data.qpos[:2], self.get_body_com("fingertip")[:2].copy()
         velocity = (
             self._fingertip_velocity() if self.velocity == "fingertip" else self.data.qvel[:2]

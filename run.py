@@ -29,6 +29,8 @@ from her import EpisodeBuffer, relabel_future
 from vcp import IMPORTANCE, PRIORITIES, HERBuffer, in_thread, update_her_buffer
 from workers import ParallelEnvs, one_torch_thread
 
+tqdm.monitor_interval = 0  # its watching thread would outlive a run
+
 
 def option(default, text, choices=None):
     """A setting that is an option of the command line too."""
@@ -61,7 +63,7 @@ class Config:
     num_workers: int | None = option(None, "processes for the environments (default: one a core)")
     # HER and DDPG
     relabel_ratio: float = 0.8
-    scored_per_update: int = 1  # mini-batches scored by Algorithm 1 for each ensemble update
+    scored_per_update: int | None = None  # mini-batches through Algorithm 1 for one of all heads
     buffer_size: int = 1_000_000  # of B_o, in transitions
     learning_rate: float = 1e-3
     polyak: float = 0.95
@@ -71,12 +73,13 @@ class Config:
 
 
 def paper_schedule(env: str) -> dict[str, int]:
-    """Appendix B's n and batch size; the number of updates is not in the paper."""
+    """Appendix B's n and batch size. Not in the paper: the number of updates, and how many
+    mini-batches Algorithm 1 scores for one update of all heads."""
     if env.startswith("FetchReach"):
-        return {"cycles": 5, "updates": 5, "batch_size": 64}
+        return {"cycles": 5, "updates": 5, "batch_size": 64, "scored_per_update": 4}
     if env.startswith(("Reacher", "SparseReacher")):
-        return {"cycles": 15, "updates": 5, "batch_size": 64}
-    return {"cycles": 50, "updates": 40, "batch_size": 256}
+        return {"cycles": 15, "updates": 5, "batch_size": 64, "scored_per_update": 4}
+    return {"cycles": 50, "updates": 40, "batch_size": 256, "scored_per_update": 1}
 
 
 def complete(config: Config) -> Config:

@@ -1,0 +1,999 @@
+"""Tests of the core, in the order of its files: vcp, her, ensemble, envs_point, workers, run.
+
+The ones marked slow train something: leave them out with  pytest -m "not slow".
+Where there is a formula, the expected value comes from a slow and obvious version of it in here.
+"""
+
+import copy
+import itertools
+import json
+import math
+import subprocess
+import sys
+import threading
+import time
+from decimal import Decimal, localcontext
+from fractions import Fraction
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from torch import nn
+
+import envs_point
+import run
+from ensemble import HIDDEN, EnsembleDDPG, Normalizer
+from envs_point import CLEARANCE, PAPER_ENVS, REACH, UsageError, make_env
+from her import EpisodeBuffer, relabel_future
+from records import COLUMNS, TIMING_COLUMNS, read_rows
+from run import Config, train
+from vcp import HERBuffer, in_thread, update_her_buffer, value_consistency_priority
+from workers import ParallelEnvs
+
+SMALL = {"epochs": 1, "cycles": 2, "updates": 2, "batch_size": 32, "eval_episodes": 16}
+
+
+def assert_frequencies(counts, probabilities):
+    """Chi-square test; the statistic has mean df and variance 2 df, so 5 sigma never fails by
+    chance in practice, and a wrong distribution does with the thousands of draws used here."""
+    expected = np.asarray(probabilities) * np.sum(counts)
+    assert np.all(np.asarray(counts)[expected == 0] == 0)
+    counts, expected = np.asarray(counts)[expected > 0], expected[expected > 0]
+    statistic, df = np.sum((counts - expected) ** 2 / expected), len(counts) - 1
+    assert abs(statistic - df) < 5 * math.sqrt(2 * df) + 5, (statistic, df)
+
+
+# ---------------------------------------------------------------------------------- vcp: Eq. (4)
+
+
+def test_priority_of_three_transitions_by_hand():
+    # σ²_max - σ² + ε with ε = 1: 4, 3, 1; squared: 16, 9, 1
+    p = value_consistency_priority(np.array([0.0, 1.0, 3.0]), temperature=2, eps=1.0)
+    np.testing.assert_allclose(p, np.array([16, 9, 1]) / 26, rtol=1e-14)
+
+
+@pytest.mark.parametrize("temperature", [1, 5, 9, 11, 15, 0.5])
+def test_priority_is_eq_4_to_the_letter(temperature):
+    variance = np.random.default_rng(0).exponential(size=50) ** 3
+    with localcontext() as exact:
+        exact.prec = 80
+        sigma2, eps = [Decimal(float(v)) for v in variance], Decimal("1e-6")
+        denominator = sum(max(sigma2) - s + eps for s in sigma2)
+        p = [((max(sigma2) - s + eps) / denominator) ** Decimal(temperature) for s in sigma2]
+        expected = [float(x / sum(p)) for x in p]
+    np.testing.assert_allclose(
+        value_consistency_priority(variance, temperature), expected, rtol=1e-9
+    )
+
+
+def test_priority_at_the_extremes():
+    # Eq. (4) as it is printed raises about 1/N to the power 𝒯: 163840^-15 is 1e-78, and the largest
+    # variance's share (1e-6 / 1e2 / N)^15 is 1e-198.
+    variance = np.random.default_rng(0).exponential(size=163_840) ** 2
+    for temperature in (15, 30):
+        p = value_consistency_priority(variance.astype(np.float32), temperature)
+        assert p.dtype == np.float64 and np.all(p > 0) and abs(p.sum() - 1) < 1e-12
+        order = np.argsort(variance.astype(np.float32), kind="stable")
+        assert np.all(np.diff(p[order]) <= 0)
+    np.testing.assert_allclose(value_consistency_priority(np.full(7, 3.0), 9), 1 / 7, rtol=1e-14)
+    assert value_consistency_priority(np.array([2.0]), 9).tolist() == [1.0]
+    for bad in ([], [1.0, math.nan], [math.inf, 0.0]):
+        with pytest.raises(ValueError):
+            value_consistency_priority(np.array(bad), 9)
+
+
+def transitions(values, obs_dim=2):
+    """A mini-batch whose rows are told apart by `values`."""
+    values = np.asarray(values, dtype=np.float32)
+    return {
+        "obs": np.repeat(values[:, None], obs_dim, axis=1),
+        "hindsight": values % 2 == 0,
+    }
+
+
+@pytest.mark.parametrize("priority", ["consistency", "variance", "uniform"])
+def test_sampling_follows_the_priorities(priority):
+    variance = np.array([0.0, 0.1, 0.2, 0.5, 0.9, 1.0])
+    buffer = HERBuffer(6, temperature=3, priority=priority)
+    buffer.add(transitions(range(6)), variance)
+    buffer.update_priorities()
+    x = {"consistency": 1 - variance, "variance": variance, "uniform": np.ones(6)}[priority] + 1e-6
+    expected = x**3 / np.sum(x**3)
+    np.testing.assert_allclose(buffer.probabilities, expected, rtol=1e-12)
+    drawn = buffer.sample(200_000, np.random.default_rng(0))["obs"][:, 0].astype(int)
+    counts = np.bincount(drawn, minlength=6)
+    rare = expected < 1e-9
+    assert counts[rare].sum() == 0
+    assert_frequencies(counts[~rare], expected[~rare] / expected[~rare].sum())
+
+
+def test_sampling_is_right_for_every_random_number():
+    buffer = HERBuffer(3, temperature=1, priority="consistency")
+    buffer.add(transitions([0, 1, 2]), np.array([2.0, 4.0, 2.0]))
+    buffer.update_priorities()
+
+    class Edge:  # the smallest and the largest that a Generator's random() gives
+        def random(self, size):
+            return np.array([0.0, np.nextafter(1, 0)])[:size]
+
+    assert buffer.sample(2, Edge())["obs"][:, 0].tolist() == [0, 2]
+
+
+@pytest.mark.parametrize("importance", ["paper", "inverse", "none"])
+def test_importance_weights(importance):
+    buffer = HERBuffer(4, temperature=2, importance=importance)
+    buffer.add(transitions(range(4)), np.array([0.0, 1.0, 2.0, 2.5]))
+    buffer.update_priorities()
+    batch = buffer.sample(64, np.random.default_rng(0))
+    p = buffer.probabilities[batch["obs"][:, 0].astype(int)]
+    w = {"paper": p, "inverse": 1 / p, "none": np.ones(64)}[importance]
+    np.testing.assert_allclose(batch["weight"], w / w.mean(), rtol=1e-6)
+
+
+def test_her_buffer_is_first_in_first_out():
+    buffer = HERBuffer(5, temperature=1)
+    for first in range(0, 12, 3):  # 0 1 2 | 3 4 5 | 6 7 8 | 9 10 11
+        values = np.arange(first, first + 3)
+        buffer.add(transitions(values), values.astype(float))
+    assert buffer.size == 5
+    kept = {float(x) for x in buffer.data["obs"][:, 0]}
+    assert kept == {7, 8, 9, 10, 11}
+    np.testing.assert_array_equal(buffer.data["variance"], buffer.data["obs"][:, 0])
+    np.testing.assert_array_equal(buffer.data["hindsight"], buffer.data["obs"][:, 0] % 2 == 0)
+    with pytest.raises(ValueError):
+        buffer.add(transitions(range(6)), np.zeros(6))
+
+
+def numbered_episodes(n=4, horizon=50, goal_dim=2):
+    """Episodes in which every achieved goal says which episode and step it is of: (e, t)."""
+    e, t = np.meshgrid(np.arange(n), np.arange(horizon + 1), indexing="ij")
+    achieved = np.stack([e, t], axis=-1).astype(np.float32)
+    return {
+        "obs": achieved * 10,
+        "achieved_goal": achieved,
+        "desired_goal": np.full((n, goal_dim), -1, np.float32),
+        "action": -achieved[:, :-1],
+    }
+
+
+def exact_reward(achieved, desired):
+    return np.where((achieved == desired).all(axis=-1), 0.0, -1.0)
+
+
+def test_algorithm_1_scores_and_stores_what_it_drew():
+    original = EpisodeBuffer(200, 50, 2, 2, 2)
+    original.add(numbered_episodes(), np.random.default_rng(0))
+    agent = EnsembleDDPG(2, 2, 2, gamma=0.98, heads=4)
+    buffer = HERBuffer(100, temperature=9)
+    for _ in range(2):
+        update_her_buffer(original, buffer, agent, 40, np.random.default_rng(1), 0.8, exact_reward)
+    assert buffer.size == 80
+    rows = {name: x[:80] for name, x in buffer.data.items()}
+    expected = agent.q_variance(rows["obs"], rows["action"], rows["goal"])
+    np.testing.assert_allclose(rows["variance"], expected, rtol=1e-5)
+    np.testing.assert_allclose(
+        buffer.probabilities, value_consistency_priority(rows["variance"], 9), rtol=1e-12
+    )
+
+
+def test_in_thread_runs_beside_the_block_and_passes_errors_on():
+    calls = []
+
+    def step():
+        calls.append(threading.current_thread())
+        time.sleep(0.001)
+
+    with in_thread(step):
+        assert len(calls) >= 1  # once before the block
+        while len(calls) < 5:
+            time.sleep(0.001)
+    count = len(calls)
+    assert threading.main_thread() not in calls[1:]
+    time.sleep(0.01)
+    assert len(calls) == count and threading.active_count() == 1
+
+    countdown = iter(range(2, -1, -1))
+
+    def fails_later():
+        1 / next(countdown)
+
+    with pytest.raises(ZeroDivisionError), in_thread(fails_later):
+        time.sleep(0.05)
+
+
+# ---------------------------------------------------------------------------------- her
+
+
+def test_future_relabelling_draws_later_steps_of_the_same_episode():
+    horizon, n = 50, 4
+    episodes = numbered_episodes(n, horizon)
+    batch = relabel_future(episodes, 400_000, np.random.default_rng(0), 0.8, exact_reward)
+    e, t = (batch["obs"] / 10).astype(int).T
+    relabelled = batch["goal"][:, 0] >= 0
+    np.testing.assert_array_equal(batch["hindsight"], relabelled)
+    np.testing.assert_array_equal(batch["action"], -batch["obs"] / 10)
+    np.testing.assert_array_equal(batch["next_obs"] - batch["obs"], [[0, 10]] * len(e))
+    np.testing.assert_array_equal(batch["goal"][~relabelled], -1)
+
+    # 80 % relabelled, 20 % original, whatever the episode and step
+    assert abs(relabelled.mean() - 0.8) < 5 * math.sqrt(0.16 / len(e))
+    assert_frequencies(np.bincount(e * horizon + t), np.full(n * horizon, 1 / (n * horizon)))
+
+    goal_episode, future = batch["goal"][relabelled].astype(int).T
+    np.testing.assert_array_equal(goal_episode, e[relabelled])
+    offset = future - t[relabelled]
+    # P(offset = j) = 1/T Σ_{t: T-t >= j} 1/(T-t), j = 1..T
+    expected = [
+        sum(Fraction(1, horizon - s) for s in range(horizon) if horizon - s >= j) / horizon
+        for j in range(1, horizon + 1)
+    ]
+    assert_frequencies(np.bincount(offset, minlength=horizon + 1)[1:], [float(p) for p in expected])
+    assert abs(float(expected[0]) - 0.08998) < 5e-6  # the goal is the own next state
+    assert float(sum(j * p for j, p in enumerate(expected, 1))) == 13.25
+    # given t, uniform over t+1..T
+    last = t[relabelled] == horizon - 3
+    counts = np.bincount(future[last], minlength=horizon + 1)[horizon - 2 :]
+    assert_frequencies(counts, np.full(3, 1 / 3))
+
+    # the reward is 0 exactly where the goal is the NEXT achieved goal
+    np.testing.assert_array_equal(batch["reward"][relabelled], np.where(offset == 1, 0.0, -1.0))
+    np.testing.assert_array_equal(batch["reward"][~relabelled], -1)
+
+
+def test_relabel_ratio_zero_and_one():
+    for ratio in (0.0, 1.0):
+        batch = relabel_future(
+            numbered_episodes(), 1000, np.random.default_rng(0), ratio, exact_reward
+        )
+        assert np.all(batch["hindsight"] == bool(ratio))
+
+
+@pytest.mark.parametrize("name", ["FetchReach-v1", "HandManipulateBlockRotateZ-v0", "Reacher-v2"])
+def test_recomputed_rewards_are_the_environments_own(name):
+    env = make_env(name)
+    rng = np.random.default_rng(0)
+    rewards, achieved, goals = [], [], []
+    for seed in range(6):
+        obs, _ = env.reset(seed=seed)
+        for _ in range(20):
+            obs, reward, *_ = env.step(rng.uniform(-1, 1, env.action_space.shape))
+            rewards.append(reward)
+            achieved.append(obs["achieved_goal"])
+            goals.append(obs["desired_goal"])
+    achieved, goals = np.float32(achieved), np.float32(goals)  # as B_o stores them
+    np.testing.assert_array_equal(env.unwrapped.compute_reward(achieved, goals, {}), rewards)
+
+
+def test_episode_buffer_fills_then_overwrites_random_episodes():
+    rng = np.random.default_rng(0)
+    buffer = EpisodeBuffer(capacity=5 * 3 + 2, horizon=3, obs_dim=2, goal_dim=2, action_dim=2)
+    episodes = numbered_episodes(9, horizon=3)
+
+    def some(*which):
+        return {name: x[list(which)] for name, x in episodes.items()}
+
+    buffer.add(some(0, 1), rng)
+    assert buffer.size == 2 and len(buffer.episodes["obs"]) == 2
+    buffer.add(some(2, 3, 4), rng)
+    np.testing.assert_array_equal(buffer.episodes["achieved_goal"], episodes["achieved_goal"][:5])
+    overwritten = set()
+    for _ in range(50):
+        buffer.add(some(5, 6), rng)
+        ids = buffer.episodes["achieved_goal"][:, 0, 0]
+        assert buffer.size == 5 and {5, 6} <= set(ids.tolist())
+        np.testing.assert_array_equal(buffer.episodes["action"][:, 0, 0], -ids)
+        overwritten |= set(np.flatnonzero(ids >= 5).tolist())
+    assert overwritten == set(range(5))
+    with pytest.raises(ValueError):
+        buffer.add({name: x[:6] for name, x in episodes.items()}, rng)
+    with pytest.raises(ValueError):
+        EpisodeBuffer(capacity=49, horizon=50, obs_dim=2, goal_dim=2, action_dim=2)
+
+
+# ---------------------------------------------------------------------------------- ensemble
+
+
+class PlainHead(nn.Module):
+    """One head's actor or critic as anyone would write it, with a trunk that may be shared."""
+
+    def __init__(self, params, trunk=None, is_actor=False):
+        super().__init__()
+        w1, b1, w2, b2, w3, b3, w4, b4 = params
+        end = [nn.Tanh()] if is_actor else []
+        self.trunk = trunk or nn.Sequential(self.layer(w1, b1), nn.ReLU(), self.layer(w2, b2), *end)
+        self.head = nn.Sequential(self.layer(w3, b3), nn.ReLU(), self.layer(w4, b4), *end)
+
+    @staticmethod
+    def layer(w, b):
+        linear = nn.Linear(*w.T.shape)
+        with torch.no_grad():
+            linear.weight.copy_(w)
+            linear.bias.copy_(b)
+        return linear
+
+    def forward(self, *x):
+        return self.head(self.trunk(torch.cat(x, dim=-1)))
+
+
+def plain_ensemble(net, is_actor):
+    """K PlainHeads that share one trunk, with the values of a MultiHeadMLP."""
+    heads, trunk = [], None
+    for k in range(len(net.heads[0])):
+        heads.append(PlainHead(net.head(k), trunk, is_actor))
+        trunk = heads[-1].trunk
+    return heads
+
+
+def random_agent(heads=16, seed=0, obs_dim=5, goal_dim=3, action_dim=2, **kwargs):
+    """An agent with biases other than 0, targets unlike the networks, and statistics."""
+    agent = EnsembleDDPG(obs_dim, goal_dim, action_dim, gamma=0.9, heads=heads, seed=seed, **kwargs)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for net in (agent.actor, agent.critic, agent.target_actor, agent.target_critic):
+            for p in (*net.trunk, *net.heads):
+                p.add_(0.05 * torch.randn(p.shape, generator=generator))
+    rng = np.random.default_rng(seed)
+    agent.normalizer.update(rng.normal(1, 2, (500, obs_dim + goal_dim)))
+    return agent
+
+
+def random_batch(n=32, obs_dim=5, goal_dim=3, action_dim=2, seed=0):
+    rng = np.random.default_rng(seed)
+    return {
+        "obs": rng.normal(size=(n, obs_dim)),
+        "action": rng.uniform(-1, 1, (n, action_dim)),
+        "next_obs": rng.normal(size=(n, obs_dim)),
+        "goal": rng.normal(size=(n, goal_dim)),
+        "reward": -rng.integers(0, 2, n).astype(float),
+        "weight": rng.uniform(0.5, 1.5, n),
+    }
+
+
+def as_tensors(agent, batch):
+    """obs|goal and next_obs|goal, normalised, then action, reward (B, 1) and weight (B, 1)."""
+    t = {name: torch.as_tensor(x, dtype=torch.float32) for name, x in batch.items()}
+    mean, std = agent.normalizer.mean, agent.normalizer.std
+    state, next_state = (
+        ((torch.cat([t[o], t["goal"]], dim=1) - mean) / std).clamp(-5, 5)
+        for o in ("obs", "next_obs")
+    )
+    return state, next_state, t["action"], t["reward"][:, None], t["weight"][:, None]
+
+
+def test_the_ensemble_is_16_separate_networks():
+    agent = random_agent()
+    batch = random_batch()
+    state, _, action, *_ = as_tensors(agent, batch)
+    actors, critics = plain_ensemble(agent.actor, True), plain_ensemble(agent.critic, False)
+    with torch.no_grad():
+        # all heads on the same rows
+        q = torch.stack([critic(state, action)[:, 0] for critic in critics])
+        variance = agent.q_variance(batch["obs"], batch["action"], batch["goal"])
+        np.testing.assert_allclose(variance, q.numpy().astype(float).var(axis=0), rtol=1e-3)
+        # each head on two rows of its own
+        expected = torch.stack([actors[k](state[2 * k : 2 * k + 2]) for k in range(16)])
+        obs, goal = batch["obs"].reshape(16, 2, -1), batch["goal"].reshape(16, 2, -1)
+        np.testing.assert_allclose(agent.act(obs, goal), expected, atol=1e-5)
+        value = [critics[k](state[2 * k : 2 * k + 2], expected[k])[:, 0].numpy() for k in range(16)]
+        np.testing.assert_allclose(agent.value(obs, goal), np.stack(value), atol=1e-4)
+        # only some heads
+        alone = agent.act(batch["obs"][None], batch["goal"][None], slice(1))
+        np.testing.assert_allclose(alone[0], actors[0](state), atol=1e-5)
+
+
+def test_networks_have_the_papers_size_and_start_like_their_targets():
+    agent = EnsembleDDPG(10, 3, 4, gamma=0.98)
+    assert HIDDEN == 256 and len(agent.actor_optimizers) == 16
+    assert [tuple(p.shape) for p in agent.critic.head(3)] == [
+        (256, 17), (256,), (256, 256), (256,), (256, 256), (256,), (1, 256), (1,),
+    ]  # fmt: skip
+    for net, target in (
+        (agent.actor, agent.target_actor),
+        (agent.critic, agent.target_critic),
+    ):
+        for p, q in zip(net.trunk + net.heads, target.trunk + target.heads, strict=True):
+            assert torch.equal(p, q) and p.data_ptr() != q.data_ptr()
+        w = net.heads[0]
+        assert abs(w.std().item() - math.sqrt(2 / 512)) < 1e-3  # Xavier-uniform
+        assert not torch.equal(w[0], w[1])
+    again = EnsembleDDPG(10, 3, 4, gamma=0.98)
+    other = EnsembleDDPG(10, 3, 4, gamma=0.98, seed=1)
+    assert torch.equal(agent.actor.heads[0], again.actor.heads[0])
+    assert not torch.equal(agent.actor.heads[0], other.actor.heads[0])
+
+
+def test_updates_are_those_of_plain_ddpg():
+    """Eqs. (2) and (3), step by step, against plain modules, plain Adam and the textbook's loss:
+    own targets, clipping, weights, gradients before steps, a head's own moments of the trunk."""
+    agent = random_agent(heads=3)
+    actors, critics = plain_ensemble(agent.actor, True), plain_ensemble(agent.critic, False)
+    target_actors = plain_ensemble(agent.target_actor, True)
+    target_critics = plain_ensemble(agent.target_critic, False)
+    optimizers = [
+        (torch.optim.Adam(a.parameters(), lr=1e-3), torch.optim.Adam(c.parameters(), lr=1e-3))
+        for a, c in zip(actors, critics, strict=True)
+    ]
+    for step, k in enumerate([1, 2, 1, 0, 1]):
+        batch = random_batch(seed=step)
+        state, next_state, action, reward, weight = as_tensors(agent, batch)
+        with torch.no_grad():
+            y = reward + 0.9 * target_critics[k](next_state, target_actors[k](next_state))
+            y = torch.clip(y, -1 / (1 - 0.9), 0)
+        critic_loss = (weight * (critics[k](state, action) - y) ** 2).mean()
+        pi = actors[k](state)
+        actor_loss = -(weight * critics[k](state, pi)).mean() + (weight * pi**2).mean()
+        actor_optimizer, critic_optimizer = optimizers[k]
+        critic_optimizer.zero_grad()
+        critic_loss.backward(retain_graph=True)
+        critic_grads = [p.grad.clone() for p in critics[k].parameters()]
+        actor_optimizer.zero_grad()
+        actor_loss.backward()
+        for p, g in zip(critics[k].parameters(), critic_grads, strict=True):
+            p.grad = g  # without what the actor's loss left there
+        critic_optimizer.step()
+        actor_optimizer.step()
+        losses = agent.update_head(k, batch)
+        torch.testing.assert_close(
+            losses, torch.stack([critic_loss, actor_loss]).detach(), rtol=1e-4, atol=1e-5
+        )
+    for plain, net in ((actors, agent.actor), (critics, agent.critic)):
+        for k in range(3):
+            for p, q in zip(plain[k].parameters(), net.head(k), strict=True):
+                torch.testing.assert_close(p, q, rtol=1e-3, atol=3e-5)
+
+
+def test_update_of_a_head_moves_it_and_the_trunk_and_nothing_else():
+    agent = random_agent(heads=4)
+    nets = (agent.actor, agent.critic, agent.target_actor, agent.target_critic)
+    before = [[p.detach().clone() for p in (*net.trunk, *net.heads)] for net in nets]
+    agent.update_head(2, random_batch())
+    for i, net in enumerate(nets):
+        for p, old in zip((*net.trunk, *net.heads), before[i], strict=True):
+            if i >= 2:  # targets
+                assert torch.equal(p, old)
+            elif any(p is q for q in net.trunk):
+                assert not torch.equal(p, old)
+            else:
+                changed = [not torch.equal(p[k], old[k]) for k in range(4)]
+                assert changed == [False, False, True, False]
+
+
+def test_targets_are_clipped_to_the_range_of_returns():
+    """With targets far outside [-1/(1-γ), 0] = [-10, 0], the loss is that of the bound."""
+    batch = random_batch()
+    for bias, bound in ((1000.0, 0.0), (-1000.0, -10.0)):
+        agent = random_agent(heads=2)
+        agent.target_critic.heads[3].fill_(bias)
+        state, _, action, _, weight = as_tensors(agent, batch)
+        with torch.no_grad():
+            q = plain_ensemble(agent.critic, False)[1](state, action)
+        loss, _ = agent.update_head(1, batch)
+        torch.testing.assert_close(loss, (weight * (q - bound) ** 2).mean(), rtol=1e-4, atol=1e-5)
+
+
+def test_polyak_moves_the_shared_trunk_once_for_each_head():
+    agent = random_agent(heads=5)
+    expected = []
+    for target, net in ((agent.target_actor, agent.actor), (agent.target_critic, agent.critic)):
+        trunk, heads = copy.deepcopy(target.trunk), copy.deepcopy(target.heads)
+        for k in range(5):  # as it is said: for each head, its trunk and its head
+            for p, q in zip(trunk, net.trunk, strict=True):
+                p.mul_(0.95).add_(0.05 * q.detach())
+            for p, q in zip(heads, net.heads, strict=True):
+                p[k] = 0.95 * p[k] + 0.05 * q[k].detach()
+        expected.append((trunk, heads))
+    agent.update_targets()
+    for target, (trunk, heads) in zip(
+        (agent.target_actor, agent.target_critic), expected, strict=True
+    ):
+        for p, q in zip(target.trunk + target.heads, trunk + heads, strict=True):
+            torch.testing.assert_close(p, q)
+
+
+def test_normalizer_against_numpy():
+    rng = np.random.default_rng(0)
+    x = rng.normal([0, 5, -1000, 3], [1, 0.1, 500, 0], (10_000, 4))
+    normalizer = Normalizer(4)
+    for part in np.array_split(x, 7):
+        normalizer.update(part)
+    clipped = np.clip(x, -200, 200)
+    mean, std = clipped.mean(axis=0), np.maximum(clipped.std(axis=0), 0.01)
+    np.testing.assert_allclose(normalizer.mean, mean, rtol=1e-5)
+    np.testing.assert_allclose(normalizer.std, std, rtol=1e-4)
+    row = torch.tensor([[100.0, 5.05, -1e9, 3.02]])
+    expected = np.clip((np.clip(row.numpy(), -200, 200) - mean) / std, -5, 5)
+    np.testing.assert_allclose(normalizer(row), expected, rtol=1e-3)
+    assert normalizer(row)[0, 0] == 5  # 100 standard deviations
+
+
+# ---------------------------------------------------------------------------------- envs_point
+
+
+def test_the_papers_names():
+    assert len(PAPER_ENVS) == 16
+    assert make_env("FetchSilce-v1").spec.id == "FetchSlide-v4"  # as Appendix A misprints them
+    assert make_env("FetchPickAndPlac-v1").spec.id == "FetchPickAndPlace-v4"
+    assert make_env("FetchPush-v4").spec.max_episode_steps == 50
+    assert make_env("HandManipulateEggFull-v1").spec.max_episode_steps == 100  # its own length
+    assert make_env("HandManipulateEggFull-v0").spec.max_episode_steps == 50  # the paper's
+    assert "HandReach-v3" in envs_point.describe("HandReach-v0")
+
+
+class Tracker(gym.Env):
+    """A goal environment from outside this project: 3 numbers, 1 of them the goal, 2 actions with
+    bounds of their own, 7 steps an episode."""
+
+    observation_space = envs_point.goal_space(3, 1)
+    action_space = gym.spaces.Box(np.float32([0, -5]), np.float32([10, 5]))
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return envs_point.sparse_reward(achieved_goal, desired_goal, 0.5)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.goal = self.np_random.uniform(-2, 2, (2, 1))
+        self.last = np.zeros(2)
+        return self._observe(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(np.float32(action)), action
+        self.last, self.x = action, self.x + 0.1 * (action[0] - 5) + 0.1 * action[1]
+        obs = self._observe()
+        reward = self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {})
+        return obs, float(reward), False, False, {}
+
+    def _observe(self):
+        observation = np.concatenate([self.x, self.last])
+        return {
+            "observation": observation,
+            "achieved_goal": self.x.copy(),
+            "desired_goal": self.goal.copy(),
+        }
+
+
+class Unlearnable(Tracker):
+    """`Tracker` with one thing changed."""
+
+    def __init__(self, **changes):
+        for name, value in changes.items():
+            setattr(self, name, value)
+
+
+gym.register("Tracker-v0", Tracker, max_episode_steps=7)
+gym.register("Unlearnable-v0", Unlearnable, max_episode_steps=7)
+gym.register("Endless-v0", Tracker)
+
+
+def test_actions_are_rescaled_to_the_environments_bounds():
+    env = make_env("Tracker-v0")
+    env.reset(seed=0)
+    for action, expected in (([-1, -1], [0, -5]), ([1, 1], [10, 5]), ([0, 0.5], [5, 2.5])):
+        env.step(np.float32(action))
+        np.testing.assert_allclose(env.unwrapped.last, expected)
+
+
+@pytest.mark.parametrize(
+    ("changes", "missing"),
+    [
+        ({"observation_space": gym.spaces.Box(-1, 1, (3,))}, "no goals"),
+        ({"action_space": gym.spaces.Discrete(3)}, "not a flat Box"),
+        ({"action_space": gym.spaces.Box(-np.inf, np.inf, (2,))}, "no bounds"),
+        ({"compute_reward": None}, "no compute_reward"),
+        ({"compute_reward": lambda a, d, i: -1.0}, "not vectorised"),
+        ({"compute_reward": lambda a, d, i: -np.abs(a - d)[:, 0]}, "-1 and 0"),
+        ({"compute_reward": lambda a, d, i: 1.0 * (a == d)[:, 0]}, "-1 and 0"),
+    ],
+)
+def test_environments_that_cannot_be_learned(changes, missing):
+    with pytest.raises(UsageError, match=missing):
+        make_env("Unlearnable-v0", **changes)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("CartPole-v1", "has no goals"),
+        ("Endless-v0", "no episode length"),
+        ("FetchReach-v9", "the nearest names are .*FetchReach-v4"),
+        ("FetchRaech-v1", "the nearest names are .*FetchReach-v1"),
+        ("FetchReach-v2", "FetchReach-v4"),  # deprecated
+        ("no_such_module:Env-v0", "no_such_module"),
+        ("FetchReachDense-v4", "-1 and 0"),
+        ("", "cannot make"),
+    ],
+)
+def test_names_that_cannot_be_made(name, message):
+    with pytest.raises(UsageError, match=message) as error:
+        make_env(name)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["PointMassEmptyEnv-v1", "PointMassWallEnv-v1", "SparseReacher-v1"]
+)
+def test_our_environments_pass_gymnasiums_checker(name, recwarn):
+    env = gym.make(name, disable_env_checker=True).unwrapped
+    check_env(env, skip_render_check="Reacher" in name)  # MuJoCo's windows need a display
+    # Reacher's spaces are unbounded, as MuJoCo's own are; the checker remarks on that
+    own = [w for w in recwarn if "infinity" not in str(w.message)]
+    assert not own, [str(w.message) for w in own]
+
+
+@pytest.mark.parametrize("name", ["PointMassEmptyEnv-v1", "PointMassWallEnv-v1"])
+def test_point_mass_renders_and_is_seeded(name):
+    env = gym.make(name, render_mode="rgb_array")
+    first, _ = env.reset(seed=3)
+    picture = env.render()
+    assert picture.shape == (240, 240, 3) and picture.dtype == np.uint8
+    colours = {tuple(c) for c in picture.reshape(-1, 3).tolist()}
+    assert len(colours) == 4  # floor, walls, circle, goal
+    # the circle is drawn where it is: rows go down, y goes up
+    rows, columns = np.nonzero((picture == (0, 114, 178)).all(axis=-1))
+    place = np.array([columns.mean() - 119.5, 119.5 - rows.mean()]) / 240 * 2 * 0.66
+    np.testing.assert_allclose(place, first["achieved_goal"], atol=0.02)
+    again, _ = env.reset(seed=3)
+    other, _ = env.reset()
+    np.testing.assert_array_equal(first["desired_goal"], again["desired_goal"])
+    assert not np.array_equal(first["desired_goal"], other["desired_goal"])
+
+
+def distance_to_wall(xy):
+    """From points (N, 2) to the wall's axis, the segment from (-inf, 0) to (0.2, 0)."""
+    nearest_x = np.minimum(xy[:, 0], 0.2)
+    return np.hypot(xy[:, 0] - nearest_x, xy[:, 1])
+
+
+@pytest.mark.parametrize("wall", [False, True])
+def test_point_mass_never_leaves_the_room_or_enters_the_wall(wall):
+    """1e6 steps from random starts, by actions that push on (a random walk would rarely touch)."""
+    env = envs_point.PointMass(wall=wall)
+    rng = np.random.default_rng(0)
+    where, goals = np.empty((1_000_000, 2)), []
+    for i in range(len(where)):
+        if i % 100 == 0:
+            obs, _ = env.reset(seed=0 if i == 0 else None)
+            goals.append(obs["desired_goal"])
+        if i % 5 == 0:
+            action = rng.uniform(-1.5, 1.5, 2)  # beyond the bounds too
+        where[i] = env.step(action)[0]["achieved_goal"]
+    assert np.abs(where).max() <= REACH and np.abs(goals).max() <= REACH
+    assert (np.abs(where) == REACH).any()
+    if wall:
+        assert distance_to_wall(where).min() >= CLEARANCE - 1e-12
+        assert distance_to_wall(np.array(goals)).min() >= CLEARANCE
+        assert (distance_to_wall(where) < CLEARANCE + 1e-12).sum() > 1000  # it was touched
+    moved = np.abs(np.diff(where.reshape(-1, 100, 2), axis=1))
+    assert moved.max() <= 0.05 * math.sqrt(2) + 1e-12
+
+
+def point_mass_at(x, y, wall=True):
+    env = envs_point.PointMass(wall=wall)
+    env.reset(seed=0)
+    env._xy = (x, y)
+    return env
+
+
+def test_the_wall_stops_what_runs_into_it_and_lets_it_slide():
+    env = point_mass_at(-0.3, 0.3)
+    for _ in range(20):
+        obs, *_ = env.step([0, -1])
+    np.testing.assert_allclose(obs["observation"], [-0.3, CLEARANCE])
+    obs, *_ = env.step([1, -1])  # slides along
+    np.testing.assert_allclose(obs["observation"], [-0.25, CLEARANCE])
+    obs, *_ = env.step([0, 1])  # and leaves
+    np.testing.assert_allclose(obs["observation"], [-0.25, CLEARANCE + 0.05])
+    # from below, and against the round end, straight and off its centre
+    assert point_mass_at(0.0, -0.1).step([0, 1])[0]["observation"].tolist() == [0.0, -CLEARANCE]
+    x, y = point_mass_at(0.3, 0.0).step([-1, 0])[0]["observation"]
+    assert (x, y) == pytest.approx((0.2 + CLEARANCE, 0.0))
+    x, y = point_mass_at(0.29, 0.03).step([-1, 0])[0]["observation"]
+    assert y > 0.03 and math.hypot(x - 0.2, y) >= CLEARANCE - 1e-12
+    # the same step in a room without the wall goes through
+    assert point_mass_at(0.0, 0.1, wall=False).step([0, -1])[0]["observation"][1] < 0.06
+
+
+def test_sliding_is_what_many_small_steps_do():
+    """`slide_along_wall` solves for the contact; pushing the point out of the wall after each of
+    1,000 small steps ends at the same place."""
+    rng = np.random.default_rng(0)
+    touched = 0
+    for _ in range(500):
+        x, y = rng.uniform([-0.5, -0.13], [0.33, 0.13])
+        if envs_point.inside_wall(x, y):
+            continue
+        d = rng.uniform(-0.05, 0.05, 2)
+        p = np.array([x, y])
+        contact = None
+        for _ in range(1000):
+            step = d / 1000
+            if contact is not None:  # after the contact, along the tangent there
+                step = step - min(step @ contact, 0) * contact
+            p = p + step
+            axis = np.array([min(p[0], 0.2), 0.0])
+            if contact is None and np.linalg.norm(p - axis) < CLEARANCE:
+                contact = (p - axis) / np.linalg.norm(p - axis)
+                touched += 1
+        expected = envs_point.slide_along_wall(x, y, x + d[0], y + d[1])
+        np.testing.assert_allclose(p, expected, atol=2e-4)
+    assert touched > 30
+
+
+def test_every_goal_can_be_reached_within_an_episode():
+    """A breadth-first search over a grid of places one step apart, by the environment's own steps:
+    from any start to the grid, along it, and so to within 0.05 of any goal, in 50 steps."""
+    env = point_mass_at(0, 0.3)
+    moves = [np.array(m, dtype=float) for m in itertools.product((-1, 0, 1), repeat=2)]
+    axis = [round(-REACH + 0.05 * i, 10) for i in range(23)]
+    places = [p for p in itertools.product(axis, axis) if not envs_point.inside_wall(*p)]
+    index = {p: i for i, p in enumerate(places)}
+    neighbours = []
+    for place in places:
+        reached = set()
+        for move in moves:
+            env._xy = place
+            obs, *_ = env.step(move)
+            end = tuple(round(float(c), 10) for c in obs["achieved_goal"])
+            if end in index:  # not where it slid to a stop between places
+                reached.add(index[end])
+        neighbours.append(reached)
+    longest = 0
+    for start in range(len(places)):
+        distance, frontier, seen = 0, {start}, {start}
+        while frontier:
+            frontier = set().union(*(neighbours[i] for i in frontier)) - seen
+            seen |= frontier
+            distance += bool(frontier)
+        assert len(seen) == len(places)
+        longest = max(longest, distance)
+    # Every place where the circle can be is within one step of a place of the grid that it can go
+    # to in a straight line, so one step leads there, and the last place is within 0.05 of the goal.
+    grid = np.array(places)
+    for _ in range(2000):
+        point = np.array(env._free_place())
+        offsets = grid - point
+        close = np.abs(offsets).max(axis=1) <= 0.05
+        direct = [
+            np.allclose(envs_point.slide_along_wall(*point, *grid[i]), grid[i])
+            for i in np.flatnonzero(close)
+        ]
+        assert any(direct), point
+        assert np.linalg.norm(offsets, axis=1).min() <= 0.05, point
+    assert longest + 1 <= 50, longest
+
+
+def test_reacher_reports_the_fingertips_velocity():
+    env = gym.make("SparseReacher-v1", disable_env_checker=True).unwrapped
+    obs, _ = env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        obs, reward, *_, info = env.step(rng.uniform(-1, 1, 2))
+        cos, sin, tip, velocity = np.split(obs["observation"], 4)
+        np.testing.assert_allclose(cos, np.cos(env.data.qpos[:2]))
+        np.testing.assert_allclose(sin, np.sin(env.data.qpos[:2]))
+        # the geometry of reacher.xml: links of 0.1 and 0.11
+        q1, q2 = env.data.qpos[0], env.data.qpos[:2].sum()
+        w1, w2 = env.data.qvel[0], env.data.qvel[:2].sum()
+        expected = [0.1 * np.cos(q1) + 0.11 * np.cos(q2), 0.1 * np.sin(q1) + 0.11 * np.sin(q2)]
+        np.testing.assert_allclose(tip, expected, atol=1e-6)
+        expected = [
+            -0.1 * np.sin(q1) * w1 - 0.11 * np.sin(q2) * w2,
+            0.1 * np.cos(q1) * w1 + 0.11 * np.cos(q2) * w2,
+        ]
+        np.testing.assert_allclose(velocity, expected, atol=1e-6)
+        np.testing.assert_array_equal(tip, obs["achieved_goal"])
+        near = np.linalg.norm(obs["achieved_goal"] - obs["desired_goal"]) <= 0.02
+        assert reward == near - 1 and info["is_success"] == near
+    joints = gym.make("SparseReacher-v1", velocity="joints", disable_env_checker=True).unwrapped
+    obs, _ = joints.reset(seed=0)
+    np.testing.assert_array_equal(obs["observation"][6:], joints.data.qvel[:2])
+
+
+# ---------------------------------------------------------------------------------- workers, run
+
+
+@pytest.mark.parametrize("name", ["FetchReach-v1", "PointMassWallEnv-v1"])
+def test_workers_play_the_same_as_one_process(name):
+    played = []
+    for workers in (1, 2):
+        with ParallelEnvs(name, 4, workers) as envs:
+            assert envs.num_workers == workers
+            envs.reset(7)
+            rng = np.random.default_rng(0)
+            dim = make_env(name).action_space.shape[0]
+            policy = lambda obs, goal: rng.uniform(-1, 1, (4, dim))  # noqa: B023, E731
+            episodes, _ = run.play(envs, policy, 5)
+            played.append(episodes)
+    for key, array in played[0].items():
+        np.testing.assert_array_equal(array, played[1][key])
+        assert len({row.tobytes() for row in array}) == 4  # each environment has its own seed
+
+
+def test_play_reads_success_at_the_last_step():
+    with ParallelEnvs("PointMassEmptyEnv-v1", 16, 1) as envs:
+        envs.reset(0)
+        episodes, success = run.play(envs, lambda obs, goal: (goal - obs) / 0.05, 50)
+        assert success.all()
+        start = np.linalg.norm(episodes["obs"][:, 0] - episodes["desired_goal"], axis=1)
+        away = np.where(start[:, None] < 9, 1.0, 0.0) * [[1.0, 1.0]]
+        _, success = run.play(envs, lambda obs, goal: np.where(obs < goal, -1, 1) * away, 50)
+        assert not success.any()
+        assert episodes["obs"].shape == (16, 51, 2) and episodes["action"].shape == (16, 50, 2)
+        np.testing.assert_array_equal(episodes["obs"], episodes["achieved_goal"])
+
+
+def test_exploration_noise():
+    rng = np.random.default_rng(0)
+    action = np.full((100_000, 2), 0.9)
+    explored = run.explore(action, rng, noise=0.2, random_actions=0.0)
+    np.testing.assert_allclose(np.quantile(explored - 0.9, 0.25), -0.2 * 0.6745, atol=0.005)
+    assert abs((explored == 1).mean() - 0.3085) < 0.01  # P(0.9 + 0.2 z > 1), clipped
+    explored = run.explore(action, rng, noise=0.0, random_actions=0.3)
+    kept = (explored == 0.9).all(axis=1)
+    assert abs(kept.mean() - 0.7) < 0.01
+    assert np.all((explored != 0.9).any(axis=1) == ~kept)  # the whole action is replaced
+    np.testing.assert_allclose(np.quantile(explored[~kept], [0.25, 0.75]), [-0.5, 0.5], atol=0.02)
+
+
+def test_heads_act_in_their_own_environments():
+    agent = random_agent(heads=4, obs_dim=2, goal_dim=2)
+    rng = np.random.default_rng(0)
+    obs, goal = rng.normal(size=(8, 2)), rng.normal(size=(8, 2))
+    actions = run.act(agent, obs, goal, 4)
+    for row in range(8):
+        k = row // 2
+        one = agent.act(obs[None, [row]], goal[None, [row]], slice(k, k + 1))
+        np.testing.assert_allclose(actions[row], one[0, 0], atol=1e-5)
+    only_first = agent.act(obs[None], goal[None], slice(1))[0]
+    np.testing.assert_allclose(run.act(agent, obs, goal, 1), only_first, atol=1e-5)
+
+
+def without_timing(folder):
+    rows = read_rows(folder)
+    return [{k: v for k, v in row.items() if k not in TIMING_COLUMNS} for row in rows]
+
+
+def test_the_same_seed_gives_the_same_rows(tmp_path):
+    settings = {**SMALL, "env": "FetchReach-v1", "epochs": 2}
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        train(Config(**settings, seed=seed, out=str(tmp_path / name)))
+    a, b, c = (without_timing(tmp_path / name) for name in "abc")
+    assert len(a) == 2 and a == b and a != c
+    assert (tmp_path / "a" / "curve.png").read_bytes()[:4] == b"\x89PNG"
+    head = (tmp_path / "a" / "progress.csv").read_text().splitlines()[0]
+    assert head == ",".join(COLUMNS)
+    # 16 environments, 50 steps: 1 warm-up and 2 cycles, then 2 cycles
+    assert [row["env_steps"] for row in a] == [3 * 800, 5 * 800]
+    # 2 cycles of 2 updates, for each of which 4 mini-batches of 32 are scored
+    assert [row["her_buffer_size"] for row in a] == [2 * 2 * 4 * 32, 2 * 2 * 2 * 4 * 32]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"priority": "uniform"},
+        {"priority": "variance"},
+        {"importance": "none"},
+        {"importance": "inverse"},
+        {"acting_head": "one"},
+        {"heads": 1},
+        {"heads": 3, "temperature": 15.0},
+        {"her_thread": True},
+        {"buffer_size": 800, "cycles": 4},
+    ],
+    ids=str,
+)
+def test_every_option_runs_to_the_end(options, tmp_path):
+    settings = {**SMALL, "env": "PointMassEmptyEnv-v1", "num_workers": 1, **options}
+    (row,) = train(Config(**settings, out=str(tmp_path / "run")))
+    assert list(row.keys() - set(COLUMNS)) == [] and len(row) == len(COLUMNS)
+    assert all(math.isfinite(value) for value in row.values()), row
+    assert threading.active_count() == 1
+
+
+def test_an_environment_from_outside_trains(tmp_path):
+    (row,) = train(Config(**SMALL, env="Tracker-v0", num_workers=1, out=str(tmp_path / "run")))
+    assert row["env_steps"] == 3 * 16 * 7
+
+
+@pytest.mark.parametrize("name", PAPER_ENVS)
+def test_one_cycle_of_each_of_the_sixteen(name):
+    """Collect, relabel, score, update: shapes, rewards, episode length."""
+    env = make_env(name)
+    dims = {k: env.observation_space[k].shape[0] for k in ("observation", "desired_goal")}
+    obs_dim, goal_dim = dims.values()
+    action_dim = env.action_space.shape[0]
+    assert env.spec.max_episode_steps == 50
+    assert (obs_dim, goal_dim, action_dim) == {
+        "Fetch": (25, 3, 4),
+        "HandR": (63, 15, 20),
+        "HandM": (61, 7, 20),
+        "Reach": (8, 2, 2),
+        "Point": (2, 2, 2),
+    }[name[:5]] or name == "FetchReach-v1"
+    agent = EnsembleDDPG(obs_dim, goal_dim, action_dim, gamma=0.98, heads=2)
+    rng = np.random.default_rng(0)
+    with ParallelEnvs(name, 2, 1) as envs:
+        envs.reset(0)
+        policy = lambda obs, goal: run.explore(run.act(agent, obs, goal, 2), rng, 0.2, 0.3)  # noqa: E731
+        episodes, success = run.play(envs, policy, 50)
+    assert episodes["obs"].shape == (2, 51, obs_dim) and success.shape == (2,)
+    assert episodes["achieved_goal"].shape == (2, 51, goal_dim)
+    original = EpisodeBuffer(1000, 50, obs_dim, goal_dim, action_dim)
+    original.add(episodes, rng)
+    buffer = HERBuffer(256, 9.0)
+
+    def reward_fn(achieved, desired):
+        return env.unwrapped.compute_reward(achieved, desired, {})
+
+    update_her_buffer(original, buffer, agent, 256, rng, 0.8, reward_fn)
+    rewards = buffer.data["reward"]
+    assert set(np.unique(rewards)) == {-1.0, 0.0} and rewards.dtype == np.float32
+    # relabelled with the own next achieved goal: reached, 7 % of the draws
+    assert np.all(rewards[(buffer.data["hindsight"])].mean() > -1)
+    losses = agent.update_head(1, buffer.sample(64, rng))
+    assert torch.isfinite(losses).all()
+
+
+def command(*arguments, cwd):
+    """The command line, in a process of its own: exit code, stdout, stderr."""
+    program = [sys.executable, str(Path(run.__file__).resolve()), *arguments]
+    done = subprocess.run(program, capture_output=True, text=True, cwd=cwd)
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env", "FetchRech-v1"], "FetchReach-v1"),
+        (["--env", "CartPole-v1"], "no goals"),
+        (["--epochs", "0"], "--epochs must be 1 or more"),
+        (["--heads", "-3"], "--heads must be 1 or more"),
+        (["--temperature", "nan"], "--temperature must be a finite number"),
+        (["--temperature", "hot"], "--temperature"),
+        (["--priority", "energy"], "--priority"),
+        (["--seed", "-1"], "--seed must be 0 or more"),
+        (["--nonsense"], "--nonsense"),
+        (["--out", "full"], "already holds a run"),
+    ],
+)
+def test_bad_input_gets_one_line_and_exit_code_2(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "progress.csv").touch()
+    with pytest.raises(SystemExit) as stop:
+        run.main(["--env", "PointMassEmptyEnv-v1", *arguments])
+    assert stop.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and message in err
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["full", "progress.csv"]
+
+
+def test_the_command_line_from_another_folder(tmp_path):
+    arguments = "--env PointMassEmptyEnv-v1 --epochs 1 --cycles 2 --updates 1 --batch-size 16"
+    code, out, err = command(*arguments.split(), "--eval-episodes", "16", cwd=tmp_path)
+    assert code == 0 and out.startswith("PointMassEmptyEnv-v1: made"), err
+    assert "test success" in out
+    folder = tmp_path / "runs" / "PointMassEmptyEnv-v1" / "vcp" / "seed0"
+    files = {"config.json", "progress.csv", "curve.png"}
+    assert files <= {p.name for p in folder.iterdir()}
+    settings = json.loads((folder / "config.json").read_text())
+    assert settings["config"]["updates"] == 1 and settings["versions"]["mujoco"]
+
+
+def test_the_schedule_is_appendix_b():
+    schedule = {name: tuple(run.paper_schedule(name).values()) for name in PAPER_ENVS}
+    assert schedule.pop("FetchReach-v1")[:3] == (5, 5, 64)
+    assert schedule.pop("Reacher-v2")[:3] == (15, 5, 64)
+    assert {s[:3] for s in schedule.values()} == {(50, 40, 256)}
+
+
+@pytest.mark.slow
+def test_point_mass_is_learned_and_not_without_relabelling(tmp_path):
+    settings = {"env": "PointMassEmptyEnv-v1", "epochs": 3, "updates": 5, "batch_size": 64}
+    learned = train(Config(**settings, out=str(tmp_path / "her")))
+    assert max(row["test_success_rate"] for row in learned) >= 0.9
+    control = train(Config(**settings, relabel_ratio=0.0, out=str(tmp_path / "no")))
+    assert max(row["test_success_rate"] for row in control) < 0.5
