@@ -130,17 +130,16 @@ class EnsembleDDPG:
         self.target_actor, self.target_critic = actor(), critic()
         self._move_targets(trunk_step=1.0, head_step=1.0)  # targets start as copies
         self.normalizer = Normalizer(state, device)
-        # One Adam for each head and network: it holds the moments of the head's own tensors AND
-        # this head's own moments of the shared trunk.
-        self.actor_optimizers, self.critic_optimizers = (
-            [
-                torch.optim.Adam(
-                    [p.requires_grad_() for p in net.head(k)], learning_rate, fused=True
-                )
-                for k in range(heads)
-            ]
-            for net in (self.actor, self.critic)
-        )
+        # One Adam for each head's actor and critic: it holds the moments of the head's own tensors
+        # AND this head's own moments of the shared trunks.
+        self.optimizers = [
+            torch.optim.Adam(
+                [p.requires_grad_() for p in (*self.critic.head(k), *self.actor.head(k))],
+                learning_rate,
+                fused=True,
+            )
+            for k in range(heads)
+        ]
 
     # ---------------------------------------------------------------- acting and scoring
 
@@ -194,21 +193,16 @@ class EnsembleDDPG:
         q = self.critic.forward(critic, torch.cat([state, action], 1))
         critic_loss = (weight * (q - target).square()).mean()
 
-        # Eq. (3): maximise E[w Q_k(s, μ_k(s, g), g)], with a penalty on large actions
+        # Eq. (3): maximise E[w Q_k(s, μ_k(s, g), g)] over θ_k, with a penalty on large actions
+        frozen = [p.detach() for p in critic]
         policy = self.actor.forward(actor, state)
-        policy_q = self.critic.forward(critic, torch.cat([state, policy], 1))
+        policy_q = self.critic.forward(frozen, torch.cat([state, policy], 1))
         actor_loss = -(weight * policy_q).mean()
         actor_loss = actor_loss + self.action_penalty * (weight * policy.square()).mean()
 
-        critic_grads = torch.autograd.grad(critic_loss, critic)
-        actor_grads = torch.autograd.grad(actor_loss, actor)
-        for params, grads, optimizer in (
-            (critic, critic_grads, self.critic_optimizers[k]),
-            (actor, actor_grads, self.actor_optimizers[k]),
-        ):
-            for param, grad in zip(params, grads, strict=True):
-                param.grad = grad
-            optimizer.step()
+        self.optimizers[k].zero_grad()
+        (critic_loss + actor_loss).backward()  # they have no parameter in common
+        self.optimizers[k].step()
         return torch.stack([critic_loss, actor_loss]).detach()
 
     def update_targets(self) -> None:
@@ -218,7 +212,7 @@ class EnsembleDDPG:
         stands still meanwhile, and K steps of 0.95 are one step of 0.95^K. With a single step for
         the trunk learning is several times slower (NOTES.md, "the trunk's targets").
         """
-        heads = len(self.actor_optimizers)
+        heads = len(self.optimizers)
         self._move_targets(trunk_step=1 - self.polyak**heads, head_step=1 - self.polyak)
 
     @torch.no_grad()

@@ -31,7 +31,7 @@ from her import EpisodeBuffer, relabel_future
 from records import COLUMNS, TIMING_COLUMNS, read_rows
 from run import Config, train
 from vcp import HERBuffer, in_thread, update_her_buffer, value_consistency_priority
-from workers import ParallelEnvs
+from workers import ParallelEnvs, read_joints_by_index
 
 SMALL = {"epochs": 1, "cycles": 2, "updates": 2, "batch_size": 32, "eval_episodes": 16}
 
@@ -386,7 +386,7 @@ def test_the_ensemble_is_16_separate_networks():
 
 def test_networks_have_the_papers_size_and_start_like_their_targets():
     agent = EnsembleDDPG(10, 3, 4, gamma=0.98)
-    assert HIDDEN == 256 and len(agent.actor_optimizers) == 16
+    assert HIDDEN == 256 and len(agent.optimizers) == 16
     assert [tuple(p.shape) for p in agent.critic.head(3)] == [
         (256, 17), (256,), (256, 256), (256,), (256, 256), (256,), (1, 256), (1,),
     ]  # fmt: skip
@@ -809,6 +809,18 @@ def test_workers_play_the_same_as_one_process(name):
     for key, array in played[0].items():
         np.testing.assert_array_equal(array, played[1][key])
         assert len({row.tobytes() for row in array}) == 4  # each environment has its own seed
+
+
+@pytest.mark.parametrize("name", ["FetchPush-v1", "HandReach-v0", "HandManipulateEggFull-v0"])
+def test_reading_joints_by_index_changes_nothing(name):
+    plain, quick = make_env(name), read_joints_by_index(make_env(name))
+    assert plain.unwrapped._utils is not quick.unwrapped._utils
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, *plain.action_space.shape))
+    pairs = [(plain.reset(seed=1)[0], quick.reset(seed=1)[0])]
+    pairs += [(plain.step(a)[0], quick.step(a)[0]) for a in actions]
+    for a, b in pairs:
+        for key in a:
+            np.testing.assert_array_equal(a[key], b[key])
 
 
 def test_play_reads_success_at_the_last_step():

@@ -1,0 +1,229 @@
+"""How fast this is, beside what limits it: python -m experiments.bench [--quick]
+
+Absolute times depend on the machine and on what else it does, so each figure is printed beside a
+yardstick that was measured in turn with it: the matrix products of an update alone, the raw
+environment, the same epoch with `--priority uniform`. Medians, with the quartiles behind them.
+"""
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import redirect_stdout
+
+import numpy as np
+import torch
+
+import run
+from ensemble import HIDDEN, EnsembleDDPG
+from envs_point import make_env
+from her import EpisodeBuffer
+from vcp import HERBuffer, update_her_buffer
+from workers import ParallelEnvs, available_cores
+
+SIZES = {"FetchReach-v1": (10, 3, 4), "FetchPush-v1": (25, 3, 4), "HandReach-v0": (63, 15, 20)}
+PAPER_MINUTES = {2: 3.2, 4: 5.6, 8: 8.5, 16: 12.0, 32: 20.7}  # Table 2, HandReach
+
+
+def in_turn(functions: dict[str, Callable], repeats: int) -> dict[str, np.ndarray]:
+    """Seconds of each call, (repeats,) for each function, the functions taking turns."""
+    seconds = {name: [] for name in functions}
+    for i in range(repeats + 1):  # the first round warms up
+        for name, function in functions.items():
+            start = time.perf_counter()
+            function()
+            if i:
+                seconds[name].append(time.perf_counter() - start)
+    return {name: np.array(s) for name, s in seconds.items()}
+
+
+def spread(x: np.ndarray, unit: float = 1, digits: int = 1) -> str:
+    low, middle, high = (unit * np.quantile(x, q) for q in (0.25, 0.5, 0.75))
+    return f"{middle:.{digits}f} ({low:.{digits}f}-{high:.{digits}f})"
+
+
+def products(batch: int, state: int, action: int) -> list[tuple[int, int, int]]:
+    """The matrix products (m, k)·(k, n) of one head's update, as (m, k, n)."""
+
+    def layers(inputs, outputs):
+        return [(inputs, HIDDEN), (HIDDEN, HIDDEN), (HIDDEN, HIDDEN), (HIDDEN, outputs)]
+
+    actor, critic = layers(state, action), layers(state + action, 1)
+
+    def forward(net):
+        return [(batch, i, j) for i, j in net]
+
+    def to_weights(net):
+        return [(i, batch, j) for i, j in net]
+
+    def to_inputs(net):
+        return [(batch, j, i) for i, j in net]
+
+    target = forward(actor) + forward(critic)
+    critic_step = forward(critic) + to_weights(critic) + to_inputs(critic[1:])
+    actor_step = forward(actor) + forward(critic) + to_inputs(critic)
+    actor_step += to_weights(actor) + to_inputs(actor[1:])
+    return target + critic_step + actor_step
+
+
+def random_batch(batch, obs_dim, goal_dim, action_dim):
+    rng = np.random.default_rng(0)
+    rows = {"obs": obs_dim, "next_obs": obs_dim, "goal": goal_dim, "action": action_dim}
+    data = {k: rng.uniform(-1, 1, (batch, d)).astype(np.float32) for k, d in rows.items()}
+    data["reward"], data["weight"] = -np.ones(batch, np.float32), np.ones(batch, np.float32)
+    return data
+
+
+def bench_update(repeats: int, heads: int = 16) -> None:
+    print(
+        "\n1. The ensemble update: 16 heads in sequence, beside its matrix products alone (floor)"
+    )
+    print(f"{'sizes of':14} {'batch':>5} {'update ms':>22} {'floor ms':>22} {'ratio':>6}")
+    for name, (obs_dim, goal_dim, action_dim) in SIZES.items():
+        for batch in (64, 256):
+            agent = EnsembleDDPG(obs_dim, goal_dim, action_dim, gamma=0.98, heads=heads)
+            data = random_batch(batch, obs_dim, goal_dim, action_dim)
+            operands = [
+                (torch.randn(m, k), torch.randn(k, n), torch.empty(m, n))
+                for m, k, n in products(batch, obs_dim + goal_dim, action_dim)
+            ]
+
+            def update(agent=agent, data=data):
+                for k in range(heads):
+                    agent.update_head(k, data)
+
+            def floor(operands=operands):
+                for _ in range(heads):
+                    for a, b, out in operands:
+                        torch.mm(a, b, out=out)
+
+            t = in_turn({"update": update, "floor": floor}, repeats)
+            ratio = np.median(t["update"]) / np.median(t["floor"])
+            print(
+                f"{name:14} {batch:5} {spread(t['update'], 1e3):>22}"
+                f" {spread(t['floor'], 1e3):>22} {ratio:6.2f}"
+            )
+
+
+def bench_collection(repeats: int, num_envs: int = 16, horizon: int = 50) -> None:
+    cores = len(available_cores())
+    print(f"\n2. Collection with {num_envs} environments, beside {cores} cores x raw env.step")
+    print(f"{'environment':14} {'steps/s':>22} {'raw, one core':>22} {'ratio':>6}")
+    for name, (obs_dim, goal_dim, action_dim) in SIZES.items():
+        agent = EnsembleDDPG(obs_dim, goal_dim, action_dim, gamma=0.98)
+        env, rng = make_env(name), np.random.default_rng(0)  # as gymnasium makes it
+        raw_actions = rng.uniform(-1, 1, (horizon, action_dim)).astype(np.float32)
+
+        def policy(obs, goal, agent=agent, rng=rng):
+            return run.explore(run.act(agent, obs, goal, 16), rng, 0.2, 0.3)
+
+        def raw(env=env, actions=raw_actions):
+            env.reset()
+            for action in actions:
+                env.step(action)
+
+        with ParallelEnvs(name, num_envs) as envs:
+            envs.reset(0)
+            t = in_turn({"play": lambda: run.play(envs, policy, horizon), "raw": raw}, repeats)
+        rate, raw_rate = num_envs * horizon / t["play"], horizon / t["raw"]
+        ratio = np.median(rate) / (cores * np.median(raw_rate))
+        print(
+            f"{name:14} {spread(rate, digits=0):>22} {spread(raw_rate, digits=0):>22} {ratio:6.2f}"
+        )
+
+
+def bench_priorities(repeats: int, heads: int = 16) -> None:
+    print("\n3. Scoring, Eq. (4) and sampling with B_h full, as a share of a cycle's training")
+    print(f"{'sizes of':14} {'scored':>8} {'score+Eq.(4) ms':>22} {'sample ms':>22} {'share':>6}")
+    for name in ("FetchPush-v1", "HandReach-v0"):
+        obs_dim, goal_dim, action_dim = SIZES[name]
+        batch, rng = 256, np.random.default_rng(0)
+        agent = EnsembleDDPG(obs_dim, goal_dim, action_dim, gamma=0.98, heads=heads)
+        env = make_env(name)
+        original = EpisodeBuffer(100_000, 50, obs_dim, goal_dim, action_dim)
+        n = original.capacity
+        shapes = {"obs": (51, obs_dim), "achieved_goal": (51, goal_dim)}
+        shapes |= {"desired_goal": (goal_dim,), "action": (50, action_dim)}
+        original.add({k: rng.normal(size=(n, *s)).astype("f4") for k, s in shapes.items()}, rng)
+        her_buffer = HERBuffer(40 * heads * batch, 9.0)
+
+        def score(size, agent=agent, env=env, original=original, her_buffer=her_buffer, rng=rng):
+            def reward_fn(achieved, desired):
+                return env.unwrapped.compute_reward(achieved, desired, {})
+
+            update_her_buffer(original, her_buffer, agent, size, rng, 0.8, reward_fn)
+
+        while her_buffer.size < her_buffer.capacity:
+            score(10 * batch)
+        data = her_buffer.sample(batch, rng)
+        for scored in (1, heads):
+            t = in_turn(
+                {
+                    "score": lambda: score(scored * batch),  # noqa: B023
+                    "sample": lambda: [her_buffer.sample(batch, rng) for _ in range(heads)],  # noqa: B023
+                    "update": lambda: [agent.update_head(k, data) for k in range(heads)],  # noqa: B023
+                },
+                repeats,
+            )
+            ours = np.median(t["score"]) + np.median(t["sample"])
+            print(
+                f"{name:14} {scored:>3} : {heads:<2} {spread(t['score'], 1e3):>22}"
+                f" {spread(t['sample'], 1e3):>22} {ours / (ours + np.median(t['update'])):6.1%}"
+            )
+
+
+def cycle_seconds(cycles: int, **settings) -> dict[str, float]:
+    """Seconds a cycle and an evaluation take, from a short real run."""
+    with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as null:
+        config = run.Config(**settings, epochs=1, cycles=cycles, eval_episodes=16, out=folder)
+        with redirect_stdout(null):
+            (row,) = run.train(config)
+    # the warm-up is not in collect_seconds; evaluation here is a tenth of an epoch's
+    collect, train = row["collect_seconds"] / cycles, row["train_seconds"] / cycles
+    return {
+        "cycle": collect + train,
+        "collect": collect,
+        "train": train,
+        "eval": row["eval_seconds"],
+    }
+
+
+def bench_epochs(cycles: int, repeats: int, head_counts: list[int]) -> None:
+    print("\n4. An epoch at the paper's settings, beside the same epoch with --priority uniform")
+    print("   (which scores B_h too: without any scoring it would lack section 3's share)")
+    for name in ("FetchPush-v1", "HandReach-v0"):
+        t = {"consistency": [], "uniform": []}
+        for _ in range(repeats):
+            for priority, rows in t.items():
+                rows.append(cycle_seconds(cycles, env=name, priority=priority))
+        cycle = {p: np.array([r["cycle"] for r in rows]) for p, rows in t.items()}
+        ratio = np.median(cycle["consistency"]) / np.median(cycle["uniform"])
+        print(
+            f"{name:14} VCP {spread(cycle['consistency'], digits=2)} s a cycle, uniform"
+            f" {spread(cycle['uniform'], digits=2)} s, ratio {ratio:.2f}"
+        )
+    print("\n5. Seconds a cycle and minutes an epoch by the number of heads, HandReach")
+    print("   heads  s/cycle  min/epoch  paper's Table 2")
+    for heads in head_counts:
+        t = cycle_seconds(cycles, env="HandReach-v0", heads=heads)
+        minutes = (50 * t["cycle"] + 10 * t["eval"]) / 60
+        print(f"   {heads:5} {t['cycle']:8.2f} {minutes:10.1f} {PAPER_MINUTES[heads]:16.1f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="fewer repeats: under a minute")
+    quick = parser.parse_args().quick
+    print(f"PyTorch {torch.__version__}, {torch.get_num_threads()} threads")
+    bench_update(3 if quick else 20)
+    bench_collection(2 if quick else 10)
+    bench_priorities(2 if quick else 15)
+    if quick:
+        bench_epochs(1, 1, [16])
+    else:
+        bench_epochs(4, 3, list(PAPER_MINUTES))
+
+
+if __name__ == "__main__":
+    main()
