@@ -862,6 +862,47 @@ def test_heads_act_in_their_own_environments():
     np.testing.assert_allclose(run.act(agent, obs, goal, 1), only_first, atol=1e-5)
 
 
+def test_train_does_what_algorithm_2_says(tmp_path, monkeypatch):
+    """The calls, in order: the heads in turn, each with a mini-batch of its own; the targets once a
+    cycle; Algorithm 1 before each round; the normaliser fed with every step."""
+    calls, agents, goals = [], [], []
+
+    class Spy(EnsembleDDPG):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            agents.append(self)
+
+        def update_head(self, k, batch):
+            calls.append((k, batch["obs"].tobytes()))
+            assert len(batch["obs"]) == 16
+            return super().update_head(k, batch)
+
+        def update_targets(self):
+            calls.append("targets")
+            super().update_targets()
+
+        def act(self, obs, goal, heads=slice(None)):
+            goals.append(goal)
+            return super().act(obs, goal, heads)
+
+    def spy_algorithm_1(*args):
+        calls.append("algorithm 1")
+        return update_her_buffer(*args)
+
+    monkeypatch.setattr(run, "EnsembleDDPG", Spy)
+    monkeypatch.setattr(run, "update_her_buffer", spy_algorithm_1)
+    settings = {**SMALL, "cycles": 2, "updates": 3, "batch_size": 16, "heads": 4, "num_workers": 1}
+    (row,) = train(Config(**settings, env="PointMassEmptyEnv-v1", out=str(tmp_path / "run")))
+    names = [call if isinstance(call, str) else call[0] for call in calls]
+    assert names == 2 * (3 * ["algorithm 1", 0, 1, 2, 3] + ["targets"])
+    batches = [call[1] for call in calls if not isinstance(call, str)]
+    assert len(set(batches)) == len(batches)
+    # 4 heads have 4 environments each: warm-up, 2 cycles and 1 round of evaluation, 50 steps each
+    assert {g.shape for g in goals} == {(4, 4, 2)} and len(goals) == 4 * 50
+    assert agents[0].normalizer.count == row["env_steps"] == 3 * 16 * 50
+    assert len({g.tobytes() for g in goals}) == 4
+
+
 def without_timing(folder):
     rows = read_rows(folder)
     return [{k: v for k, v in row.items() if k not in TIMING_COLUMNS} for row in rows]
@@ -1000,6 +1041,10 @@ def test_the_schedule_is_appendix_b():
     assert schedule.pop("FetchReach-v1")[:3] == (5, 5, 64)
     assert schedule.pop("Reacher-v2")[:3] == (15, 5, 64)
     assert {s[:3] for s in schedule.values()} == {(50, 40, 256)}
+    c = Config()
+    assert (c.heads, c.epochs, c.eval_episodes, c.buffer_size) == (16, 50, 160, 1_000_000)
+    assert (c.relabel_ratio, c.learning_rate, c.polyak) == (0.8, 1e-3, 0.95)
+    assert (c.noise, c.random_actions, c.action_penalty, c.temperature) == (0.2, 0.3, 1.0, 9.0)
 
 
 @pytest.mark.slow
