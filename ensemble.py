@@ -87,6 +87,18 @@ class Normalizer:
         self.mean.copy_(torch.from_numpy(mean))
         self.std.copy_(torch.from_numpy(np.sqrt(np.maximum(variance, 0.01**2))))
 
+    def state_dict(self) -> dict:
+        sums = {"sum": self.sum, "sum_of_squares": self.sum_of_squares}
+        tensors = {name: torch.from_numpy(x) for name, x in sums.items()}
+        return {"count": self.count, "mean": self.mean, "std": self.std, **tensors}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.count = state["count"]
+        self.mean.copy_(state["mean"])
+        self.std.copy_(state["std"])
+        self.sum = state["sum"].numpy()
+        self.sum_of_squares = state["sum_of_squares"].numpy()
+
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         return ((x.clamp(-200, 200) - self.mean) / self.std).clamp(-5, 5)
 
@@ -220,6 +232,29 @@ class EnsembleDDPG:
         for target, net in ((self.target_actor, self.actor), (self.target_critic, self.critic)):
             torch._foreach_lerp_(target.trunk, net.trunk, trunk_step)
             torch._foreach_lerp_(target.heads, net.heads, head_step)
+
+    # ---------------------------------------------------------------- checkpoints
+
+    def _networks(self) -> list[MultiHeadMLP]:
+        return [self.actor, self.critic, self.target_actor, self.target_critic]
+
+    def state_dict(self) -> dict:
+        """Networks, targets, every optimiser's moments and the normaliser, as tensors."""
+        return {
+            "networks": [[p.detach() for p in net.trunk + net.heads] for net in self._networks()],
+            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
+            "normalizer": self.normalizer.state_dict(),
+        }
+
+    @torch.no_grad()
+    def load_state_dict(self, state: dict) -> None:
+        """Take over a `state_dict` of an agent of the same sizes."""
+        for net, saved in zip(self._networks(), state["networks"], strict=True):
+            for p, value in zip(net.trunk + net.heads, saved, strict=True):
+                p.copy_(value)
+        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
+            optimizer.load_state_dict(saved)
+        self.normalizer.load_state_dict(state["normalizer"])
 
     # ---------------------------------------------------------------- NumPy to network
 

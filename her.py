@@ -7,6 +7,7 @@ Letters in the shape comments:
 from collections.abc import Callable
 
 import numpy as np
+import torch
 
 Batch = dict[str, np.ndarray]
 RewardFn = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -51,6 +52,15 @@ class EpisodeBuffer:
         for name, array in self._data.items():
             array[slots] = episodes[name]
         self.size += free
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """What a checkpoint keeps of it: the stored episodes."""
+        return {name: torch.from_numpy(array) for name, array in self.episodes.items()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        self.size = len(state["action"])
+        for name, array in self._data.items():
+            array[: self.size] = state[name].numpy()
 
 
 def relabel_future(

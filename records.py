@@ -1,13 +1,22 @@
-"""The folder of a run: config.json (what was asked), progress.csv (a row an epoch), curve.png."""
+"""The folder of a run: config.json (what was asked), progress.csv (a row an epoch), curve.png and
+checkpoint.pt (all that is needed to go on).
+
+Each file is written beside its place and moved there when it is whole, so whatever happens, what
+stands in the folder is whole: the last epoch's or the one before.
+"""
 
 import csv
+import io
 import json
+import os
+import pickle
 import platform
 import subprocess
 from importlib.metadata import version
 from pathlib import Path
 
 import matplotlib
+import torch
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -33,29 +42,60 @@ COLUMNS = [
 ]
 TIMING_COLUMNS = {name for name in COLUMNS if name.endswith("_seconds")}
 PACKAGES = ("numpy", "torch", "gymnasium", "gymnasium-robotics", "mujoco")
+CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
 
 
-def start(folder: Path, config: dict) -> None:
-    """Make the run's folder: config.json and the head of progress.csv.
-    UsageError if the folder holds a run already."""
-    if (folder / "progress.csv").exists():
-        raise UsageError(f"{folder} already holds a run: delete it or choose another --out")
-    folder.mkdir(parents=True, exist_ok=True)
-    about = {
-        "config": config,
-        "versions": {"python": platform.python_version()} | {p: version(p) for p in PACKAGES},
-        "commit": _commit(),
-    }
-    (folder / "config.json").write_text(json.dumps(about, indent=2) + "\n")
-    with open(folder / "progress.csv", "w", newline="") as file:
-        csv.writer(file).writerow(COLUMNS)
+def write_whole(path: Path, write) -> None:
+    """Make the file at `path` what write(binary file) writes, all of it or nothing."""
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        with open(temporary, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
-def add_row(folder: Path, row: dict) -> None:
-    """Append one epoch to progress.csv and redraw curve.png."""
-    with open(folder / "progress.csv", "a", newline="") as file:
-        csv.DictWriter(file, COLUMNS).writerow(row)
-    draw_curve(folder)
+def write_config(folder: Path, config: dict) -> None:
+    """config.json: the settings, the versions and the commit of the code."""
+    versions = {"python": platform.python_version()} | {p: version(p) for p in PACKAGES}
+    about = {"config": config, "versions": versions, "commit": _commit()}
+    text = json.dumps(about, indent=2) + "\n"
+    write_whole(folder / "config.json", lambda file: file.write(text.encode()))
+
+
+def read_config(folder: Path) -> dict:
+    """The settings of the run in `folder`. UsageError if there is none."""
+    try:
+        return json.loads((folder / "config.json").read_text())["config"]
+    except (OSError, ValueError, KeyError) as error:
+        raise UsageError(f"{folder} does not hold a run: no readable config.json") from error
+
+
+def start(folder: Path, config: dict, rows: list[dict], resume: bool) -> None:
+    """Make the run's folder, or with `resume` bring it to the state of the rows of its checkpoint.
+    UsageError if it holds a run that is not resumed, or cannot be written to."""
+    if not resume and (folder / "config.json").exists():
+        raise UsageError(f"{folder} already holds a run: --resume it, or choose another --out")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_config(folder, config)
+        write_rows(folder, rows)
+    except OSError as error:
+        raise UsageError(f"cannot write to {folder}: {error.strerror}") from error
+
+
+def write_rows(folder: Path, rows: list[dict]) -> None:
+    """progress.csv, and curve.png if there are rows."""
+    text = io.StringIO(newline="")
+    table = csv.DictWriter(text, COLUMNS)
+    table.writeheader()
+    table.writerows(rows)
+    write_whole(folder / "progress.csv", lambda file: file.write(text.getvalue().encode()))
+    if rows:
+        _draw_curve(folder, rows, read_config(folder))
 
 
 def read_rows(folder: Path) -> list[dict[str, float]]:
@@ -64,10 +104,46 @@ def read_rows(folder: Path) -> list[dict[str, float]]:
         return [{name: float(x) for name, x in row.items()} for row in csv.DictReader(file)]
 
 
-def draw_curve(folder: Path) -> None:
-    """Success rate by epoch, as curve.png."""
-    rows = read_rows(folder)
-    title = json.loads((folder / "config.json").read_text())["config"]
+def save_checkpoint(folder: Path, state: dict) -> None:
+    """checkpoint.pt, keeping the one before it. state: tensors and plain Python alone."""
+
+    def save(file):
+        try:
+            torch.save(state, file)
+        except RuntimeError as error:  # torch's own, from closing its archive on a full disk
+            raise error.__context__ if isinstance(error.__context__, OSError) else error from None
+
+    path = folder / CHECKPOINT
+    write_whole(folder / "checkpoint.new.pt", save)
+    if path.exists():
+        os.replace(path, folder / PREVIOUS)
+    os.replace(folder / "checkpoint.new.pt", path)
+
+
+def load_checkpoint(folder: Path) -> dict | None:
+    """The newest readable checkpoint; None if the run has none yet. UsageError if none is whole."""
+    paths = [folder / name for name in ("checkpoint.new.pt", CHECKPOINT, PREVIOUS)]
+    found = [path for path in paths if path.exists()]
+    for path in found:
+        try:
+            return torch.load(path, map_location="cpu", weights_only=True)
+        except (RuntimeError, EOFError, OSError, pickle.UnpicklingError) as error:
+            print(f"{path} is damaged ({type(error).__name__}), trying the one before")
+    if found:
+        raise UsageError(f"no checkpoint in {folder} can be read: they are damaged")
+    return None
+
+
+def add_to_tensorboard(folder: Path, row: dict) -> None:
+    """The row's numbers, by epoch, into the folder's TensorBoard log."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    with SummaryWriter(folder / "tensorboard") as board:
+        for name, value in row.items():
+            board.add_scalar(name, value, row["epoch"])
+
+
+def _draw_curve(folder: Path, rows: list[dict], config: dict) -> None:
     epochs = [row["epoch"] for row in rows]
     fig, ax = plt.subplots(figsize=(6, 3.6), layout="constrained")
     for column, label, style in (
@@ -76,10 +152,11 @@ def draw_curve(folder: Path) -> None:
     ):
         ax.plot(epochs, [row[column] for row in rows], style, markersize=3, label=label)
     ax.set(xlabel="epoch", ylabel="success rate", ylim=(-0.03, 1.03))
-    ax.set_title(f"{title['method'].upper()} on {title['env']}, seed {title['seed']}")
+    ax.xaxis.get_major_locator().set_params(integer=True)
+    ax.set_title(f"{config['method'].upper()} on {config['env']}, seed {config['seed']}")
     ax.legend(loc="lower right")
     ax.grid(alpha=0.3)
-    fig.savefig(folder / "curve.png", dpi=110)
+    write_whole(folder / "curve.png", lambda file: fig.savefig(file, dpi=110, format="png"))
     plt.close(fig)
 
 

@@ -1,111 +1,39 @@
-"""Algorithm 2, the VCP algorithm, line by line, and its command line.
+"""Algorithm 2, the VCP algorithm, line by line.
 
     python run.py --env FetchReach-v1
 
-`train` is the algorithm and `Config` holds every hyper-parameter.
+`train` is the algorithm; its settings and the command line's are in options.py.
 
 Letters in the shape comments:
     K heads    N environments    T steps of an episode    O observation    G goal    A action
 """
 
-import argparse
 import math
 import sys
 import time
 from collections import defaultdict
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict
 from pathlib import Path
-from typing import NoReturn, get_args
 
+import gymnasium as gym
 import numpy as np
 import torch
 from tqdm import tqdm
 
+import options
 import records
 from ensemble import EnsembleDDPG
 from envs_point import UsageError, describe, make_env
 from her import EpisodeBuffer, relabel_future
-from vcp import IMPORTANCE, PRIORITIES, HERBuffer, in_thread, update_her_buffer
+from options import Config
+from vcp import HERBuffer, in_thread, update_her_buffer
 from workers import ParallelEnvs, one_torch_thread
 
 tqdm.monitor_interval = 0  # its watching thread would outlive a run
 
 
-def option(default, text, choices=None):
-    """A setting that is an option of the command line too."""
-    return field(default=default, metadata={"help": text, "choices": choices})
-
-
-@dataclass
-class Config:
-    """Every setting of a run. NOTES.md says which of them the paper gives, and where."""
-
-    env: str = option("FetchReach-v1", "the paper's name, the id of a goal environment, module:ID")
-    method: str = option("vcp", "what to train", ["vcp"])
-    seed: int = option(0, "of everything that is random")
-    out: str | None = option(None, "the run's folder (default: runs/<env>/<method>/seed<seed>)")
-    # The schedule, Appendix B; None is filled in by `paper_schedule`
-    epochs: int = option(50, "M in Algorithm 2")
-    cycles: int | None = option(None, "n in Appendix B, collections an epoch: 5, 15 or 50 by env")
-    updates: int | None = option(None, "updates of all heads in turn, a cycle: 5 or 40 by env")
-    batch_size: int | None = option(None, "of one head's mini-batch: 64 or 256 by env")
-    eval_episodes: int = option(160, "an epoch; rounded up to the same number for each head")
-    # VCP, Section 4
-    heads: int = option(16, "K: actors and critics")
-    temperature: float = option(9.0, "𝒯 in Eq. (4); the paper takes one of 1, 5, 9, 11, 15")
-    priority: str = option("consistency", "Eq. (4), or an ablation of Section 5.6", [*PRIORITIES])
-    importance: str = option("paper", "w_i: Section 4.3, Schaul et al., or 1", [*IMPORTANCE])
-    acting_head: str = option("all", "the heads that collect, Section 5.6", ["all", "one"])
-    her_thread: bool = option(False, "Algorithm 1 in a thread, as in the paper; not reproducible")
-    # The machine
-    device: str = option("auto", "for the networks; auto: a GPU if any", ["auto", "cpu", "cuda"])
-    num_workers: int | None = option(None, "processes for the environments (default: one a core)")
-    # HER and DDPG
-    relabel_ratio: float = 0.8
-    scored_per_update: int | None = None  # mini-batches through Algorithm 1 for one of all heads
-    buffer_size: int = 1_000_000  # of B_o, in transitions
-    learning_rate: float = 1e-3
-    polyak: float = 0.95
-    noise: float = 0.2  # standard deviation of the exploration noise; actions are in [-1, 1]
-    random_actions: float = 0.3  # share of actions that are uniformly random
-    action_penalty: float = 1.0
-
-
-def paper_schedule(env: str) -> dict[str, int]:
-    """Appendix B's n and batch size. Not in the paper: the number of updates, and how many
-    mini-batches Algorithm 1 scores for one update of all heads."""
-    if env.startswith("FetchReach"):
-        return {"cycles": 5, "updates": 5, "batch_size": 64, "scored_per_update": 4}
-    if env.startswith(("Reacher", "SparseReacher")):
-        return {"cycles": 15, "updates": 5, "batch_size": 64, "scored_per_update": 4}
-    return {"cycles": 50, "updates": 40, "batch_size": 256, "scored_per_update": 1}
-
-
-def complete(config: Config) -> Config:
-    """A copy with schedule, device and folder filled in. UsageError for a setting out of range."""
-    given = {name: value for name, value in asdict(config).items() if value is not None}
-    config = Config(**{**paper_schedule(config.env), **given})
-    for f in fields(config):
-        value, flag = getattr(config, f.name), "--" + f.name.replace("_", "-")
-        choices = f.metadata.get("choices")
-        if choices and value not in choices:
-            raise UsageError(f"{flag} must be one of {', '.join(choices)}, not {value!r}")
-        if isinstance(value, int) and value < 1 and f.name not in ("seed", "her_thread"):
-            raise UsageError(f"{flag} must be 1 or more, not {value}")
-    if config.seed < 0:
-        raise UsageError(f"--seed must be 0 or more, not {config.seed}")
-    if not math.isfinite(config.temperature):
-        raise UsageError(f"--temperature must be a finite number, not {config.temperature}")
-    if config.device == "auto":
-        config.device = "cuda" if torch.cuda.is_available() else "cpu"
-    if config.device == "cuda" and not torch.cuda.is_available():
-        raise UsageError("--device cuda: no CUDA device was found")
-    config.out = config.out or f"runs/{config.env}/{config.method}/seed{config.seed}"
-    return config
-
-
-def play(envs: ParallelEnvs, policy, horizon: int) -> tuple[dict, np.ndarray]:
+def rollout(envs: ParallelEnvs, policy, horizon: int) -> tuple[dict, np.ndarray]:
     """Algorithm 2, lines 4-11: an episode in each environment, all at once.
 
     policy: (N, O) observations and (N, G) goals -> (N, A) actions in [-1, 1].
@@ -154,7 +82,7 @@ def evaluate(envs, agent: EnsembleDDPG, heads: int, horizon: int, rounds: int, b
     rate, and the mean of Q_k(s, μ_k(s, g), g) over all steps."""
     successes, q = [], []
     for _ in range(rounds):
-        episodes, success = play(envs, lambda obs, goal: act(agent, obs, goal, heads), horizon)
+        episodes, success = rollout(envs, lambda obs, goal: act(agent, obs, goal, heads), horizon)
         obs = episodes["obs"][:, :-1]  # (N, T, O)
         goal = np.repeat(episodes["desired_goal"][:, None], horizon, axis=1)  # (N, T, G)
         q.append(agent.value(by_head(obs, heads), by_head(goal, heads)))
@@ -184,18 +112,34 @@ def timed(seconds: dict[str, float], name: str):
     seconds[name] += time.perf_counter() - start
 
 
-def train(config: Config) -> list[dict]:
+def make_agent(config: Config, env: gym.Env) -> EnsembleDDPG:
+    """Algorithm 2, line 1: the off-policy algorithm 𝔸, for an environment of `make_env`."""
+    return EnsembleDDPG(
+        obs_dim=env.observation_space["observation"].shape[0],
+        goal_dim=env.observation_space["desired_goal"].shape[0],
+        action_dim=env.action_space.shape[0],
+        heads=config.heads,
+        gamma=1 - 1 / env.spec.max_episode_steps,
+        learning_rate=config.learning_rate,
+        polyak=config.polyak,
+        action_penalty=config.action_penalty,
+        device=config.device,
+        seed=config.seed,
+    )
+
+
+def train(config: Config, resume: bool = False) -> list[dict]:
     """Algorithm 2. Writes the run's folder and gives the rows of its progress.csv.
 
-    Everything random follows from (seed, epoch). UsageError, before anything is written, for a
-    config that cannot be run; FloatingPointError where NaN or Inf turns up.
+    resume: go on with the run in config.out, after its last whole epoch. Everything random follows
+    from (seed, epoch), so the rows are those of a run that was never stopped.
+    UsageError, before anything is written, for a config that cannot be run; FloatingPointError
+    where NaN or Inf turns up.
     """
-    config = complete(config)
+    config = options.complete(config)
+    folder = Path(config.out)
     env = make_env(config.env)
     env.close()
-    obs_dim = env.observation_space["observation"].shape[0]
-    goal_dim = env.observation_space["desired_goal"].shape[0]
-    action_dim = env.action_space.shape[0]
     horizon = env.spec.max_episode_steps  # T
     heads, batch_size = config.heads, config.batch_size
     # One environment a head; fewer than 16 heads have several each, for the paper's amount of data.
@@ -203,19 +147,9 @@ def train(config: Config) -> list[dict]:
     test_rounds = math.ceil(config.eval_episodes / num_envs)
 
     # Line 1: the off-policy algorithm 𝔸, B_o and B_h
-    agent = EnsembleDDPG(
-        obs_dim,
-        goal_dim,
-        action_dim,
-        heads=heads,
-        gamma=1 - 1 / horizon,
-        learning_rate=config.learning_rate,
-        polyak=config.polyak,
-        action_penalty=config.action_penalty,
-        device=config.device,
-        seed=config.seed,
-    )
-    original_buffer = EpisodeBuffer(config.buffer_size, horizon, obs_dim, goal_dim, action_dim)
+    agent = make_agent(config, env)
+    dims = [env.observation_space[name].shape[0] for name in ("observation", "desired_goal")]
+    original_buffer = EpisodeBuffer(config.buffer_size, horizon, *dims, env.action_space.shape[0])
     her_buffer = HERBuffer(
         capacity=batch_size * config.updates * heads,  # what a cycle draws
         temperature=config.temperature,
@@ -228,7 +162,7 @@ def train(config: Config) -> list[dict]:
 
     def collect(random_actions):  # lines 3-11
         acting = heads if config.acting_head == "all" else 1
-        episodes, success = play(
+        episodes, success = rollout(
             envs,
             lambda obs, goal: explore(
                 act(agent, obs, goal, acting), play_rng, config.noise, random_actions
@@ -247,11 +181,19 @@ def train(config: Config) -> list[dict]:
         ratio = config.relabel_ratio
         update_her_buffer(original_buffer, her_buffer, agent, size, her_rng, ratio, reward_fn)
 
-    folder, rows, env_steps, start = Path(config.out), [], 0, time.perf_counter()
+    rows, env_steps, start = [], 0, time.perf_counter()
+    parts = (agent, original_buffer, her_buffer)
+    saved = records.load_checkpoint(folder) if resume else None
+    if saved:
+        for part, state in zip(parts, saved["parts"], strict=True):
+            part.load_state_dict(state)
+        rows = saved["rows"]
+        env_steps, start = rows[-1]["env_steps"], start - rows[-1]["wall_seconds"]
+
     with ParallelEnvs(config.env, num_envs, config.num_workers) as envs:
-        records.start(folder, asdict(config))
+        records.start(folder, asdict(config), rows, resume)
         print(describe(config.env))
-        for epoch in range(1, config.epochs + 1):  # line 2
+        for epoch in range(len(rows) + 1, config.epochs + 1):  # line 2
             seeds = np.random.SeedSequence([config.seed, epoch])
             train_seed, test_seed = map(int, seeds.generate_state(2))
             play_rng, her_rng, draw_rng = map(np.random.default_rng, seeds.spawn(3))
@@ -286,59 +228,58 @@ def train(config: Config) -> list[dict]:
             critic_loss, actor_loss = torch.stack(losses).mean(dim=0).tolist()
             if not math.isfinite(critic_loss + actor_loss):
                 raise FloatingPointError(f"NaN or Inf in the losses of epoch {epoch}")
-            rows.append(
-                {
-                    "epoch": epoch,
-                    "env_steps": env_steps,
-                    "wall_seconds": time.perf_counter() - start,
-                    "train_success_rate": float(np.mean(successes)),
-                    **test,
-                    "critic_loss": critic_loss,
-                    "actor_loss": actor_loss,
-                    **variance_by_kind(agent, her_buffer),
-                    "batch_original_fraction": float(np.mean(originals)),
-                    "her_buffer_size": her_buffer.size,
-                    **{f"{name}_seconds": value for name, value in seconds.items()},
-                }
+            row = {
+                "epoch": epoch,
+                "env_steps": env_steps,
+                "wall_seconds": time.perf_counter() - start,
+                "train_success_rate": float(np.mean(successes)),
+                **test,
+                "critic_loss": critic_loss,
+                "actor_loss": actor_loss,
+                **variance_by_kind(agent, her_buffer),
+                "batch_original_fraction": float(np.mean(originals)),
+                "her_buffer_size": her_buffer.size,
+                **{f"{name}_seconds": value for name, value in seconds.items()},
+            }
+            rows.append(row)
+            records.save_checkpoint(
+                folder, {"rows": rows, "parts": [p.state_dict() for p in parts]}
             )
-            records.add_row(folder, rows[-1])
+            records.write_rows(folder, rows)
+            if config.tensorboard:
+                records.add_to_tensorboard(folder, row)
             tqdm.write(
                 "epoch {epoch:3d}  steps {env_steps:7d}  test success {test_success_rate:.3f}  "
                 "train success {train_success_rate:.3f}  Q {test_q:6.2f}  "
-                "{wall_seconds:.0f} s".format(**rows[-1])
+                "{wall_seconds:.0f} s".format(**row)
             )
     return rows
 
 
-def parse(argv: list[str] | None) -> Config:
-    """The command line: an option for each field of Config that has a text."""
-    parser = argparse.ArgumentParser(description="Value Consistency Prioritization: VCP")
-    parser.error = fail
-    for f in fields(Config):
-        if not f.metadata:
-            continue
-        flag, text = "--" + f.name.replace("_", "-"), f.metadata["help"]
-        if f.type is bool:
-            parser.add_argument(flag, action="store_true", help=text)
-        else:
-            kind = next(t for t in (int, float, str) if t in (f.type, *get_args(f.type)))
-            text += "" if f.default is None else " (default: %(default)s)"
-            choices = f.metadata["choices"]
-            parser.add_argument(flag, type=kind, default=f.default, choices=choices, help=text)
-    return Config(**vars(parser.parse_args(argv)))
-
-
-def fail(message: str) -> NoReturn:
-    print(f"run.py: {message}", file=sys.stderr)
-    sys.exit(2)
-
-
 def main(argv: list[str] | None = None) -> None:
-    config = parse(argv)
+    """The command line. Exit code 2 and one line for bad input, 1 and one line for a run that
+    something outside the program stopped, 130 for Ctrl-C."""
+    given, command = options.parse(argv)
     try:
-        train(config)
+        if command.play:
+            from play import play  # it imports this module
+
+            play(Path(command.play), command.gif)
+            return
+        config = Config(**given)
+        if command.resume:
+            saved = Config(**records.read_config(Path(command.resume)))
+            config = options.changed(saved, {**given, "out": command.resume})
+        config = options.complete(config)
+        how_on = f"the last whole epoch is kept: python run.py --resume {config.out}"
+        train(config, resume=bool(command.resume))
     except UsageError as error:
-        fail(str(error))
+        options.fail(str(error))
+    except (FloatingPointError, OSError) as error:
+        sys.exit(f"run.py: stopped: {error}; {how_on}")
+    except KeyboardInterrupt:
+        print(f"\nstopped; {how_on}")
+        sys.exit(130)
 
 
 if __name__ == "__main__":

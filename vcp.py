@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
+import torch
 
 from ensemble import EnsembleDDPG
 from her import Batch, EpisodeBuffer, RewardFn, relabel_future
@@ -23,15 +24,15 @@ def value_consistency_priority(
     """Eq. (4) and its normalisation: the probabilities to draw each transition of B_h.
 
     variance: (N,), σ²_i over the critics; temperature: 𝒯; eps: ε. Gives (N,) float64, summing to 1.
-    ValueError unless there is at least one variance and all are finite.
+    FloatingPointError if a variance is NaN or Inf.
 
     The sum inside Eq. (4) is the same for all i, so normalising cancels it, and any other common
     factor may stand in its place. Here it is the largest term: the ratios lie in (0, 1] and one of
     them is 1, so their powers neither overflow nor all vanish, whatever 𝒯 and N are.
     """
     variance = np.asarray(variance, dtype=np.float64)
-    if not (variance.size and np.isfinite(variance).all()):
-        raise ValueError("Eq. (4) needs at least one variance, all of them finite")
+    if not np.isfinite(variance).all():
+        raise FloatingPointError("NaN or Inf in the variance of the Q-values")
     consistency = variance.max() - variance + eps  # σ²_max - σ²_i + ε
     priority = (consistency / consistency.max()) ** temperature  # p_i = (...)^𝒯
     return priority / priority.sum()  # p_i / Σ p
@@ -106,6 +107,18 @@ class HERBuffer:
             weight = self._importance(self.probabilities[i])
         batch["weight"] = (weight / weight.mean()).astype(np.float32)
         return batch
+
+    def state_dict(self) -> dict:
+        """What a checkpoint keeps of it: the stored rows, and where the next ones go."""
+        rows = {name: torch.from_numpy(x[: self.size]) for name, x in self.data.items()}
+        return {"rows": rows, "next": self._next}
+
+    def load_state_dict(self, state: dict) -> None:
+        rows = {name: x.numpy() for name, x in state["rows"].items()}
+        self.data, self.size, self._next = {}, 0, 0
+        self.add(rows, rows.pop("variance"))
+        self._next = state["next"]
+        self.update_priorities()
 
 
 def update_her_buffer(

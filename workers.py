@@ -5,6 +5,7 @@ environments on two cores that is a third of the time. So a worker holds a group
 """
 
 import os
+import signal
 from contextlib import contextmanager
 from functools import partial
 from types import SimpleNamespace
@@ -59,12 +60,16 @@ class EnvGroup(gym.Env):
 
     "is_success" of the step's info is the environment's own or, without one, Eq. (1)'s reward of 0.
     Nothing is reset by itself: episodes have a fixed length, and an environment that ends one early
-    raises RuntimeError. core: the one processor this process may then use, None for any.
+    raises RuntimeError. main: the main process's id; in any other process Ctrl-C is ignored and, if
+    `core` is given, that is the one processor that the process may use.
     """
 
-    def __init__(self, name: str, size: int, core: int | None = None):
-        if core is not None:
-            os.sched_setaffinity(0, {core})
+    def __init__(self, name: str, size: int, main: int, core: int | None = None):
+        # AsyncVectorEnv makes one of these in the main process too, to look at its spaces.
+        if os.getpid() != main:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            if core is not None:
+                os.sched_setaffinity(0, {core})
 
         def make():
             return read_joints_by_index(make_env(name))
@@ -97,7 +102,7 @@ class ParallelEnvs:
     def __init__(self, name: str, num_envs: int, num_workers: int | None = None):
         cores = available_cores()
         most = min(num_workers or len(cores), num_envs)
-        self.num_envs = num_envs
+        self.name, self.num_envs = name, num_envs
         self.num_workers = max(w for w in range(1, most + 1) if num_envs % w == 0)
         self._group_size = num_envs // self.num_workers
         # Left alone, the scheduler wakes workers on the same core while another idles: with a core
@@ -105,7 +110,7 @@ class ParallelEnvs:
         # machine with other runs, and stay free.
         pin = 1 < self.num_workers == len(cores) and hasattr(os, "sched_setaffinity")
         groups = [
-            partial(EnvGroup, name, self._group_size, cores[i] if pin else None)
+            partial(EnvGroup, name, self._group_size, os.getpid(), cores[i] if pin else None)
             for i in range(self.num_workers)
         ]
         vector = AsyncVectorEnv if self.num_workers > 1 else SyncVectorEnv
@@ -116,19 +121,32 @@ class ParallelEnvs:
         it goes on with the random numbers it has. Gives arrays of (num_envs, ...)."""
         firsts = range(0, self.num_envs, self._group_size)
         seeds = None if seed is None else [seed + first for first in firsts]
-        return self._flat(self._envs.reset(seed=seeds)[0])
+        return self._flat(self._ask(self._envs.reset, seed=seeds)[0])
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """One step in each: actions (num_envs, A) in [-1, 1] -> observations, is_success (N,)."""
         action = action.reshape(self.num_workers, self._group_size, -1)
-        obs, _, _, _, info = self._envs.step(action)
+        obs, _, _, _, info = self._ask(self._envs.step, action)
         return self._flat(obs), info["is_success"].reshape(-1)
 
     def _flat(self, obs):
         return {name: x.reshape(self.num_envs, -1) for name, x in obs.items()}
 
+    def _ask(self, method, *args, **kwargs):
+        """Call it, and if a worker is found dead say which environment's and how it ended."""
+        try:
+            return method(*args, **kwargs)
+        except (EOFError, ConnectionError) as error:
+            for process in self._envs.processes:
+                process.join(timeout=1)
+            codes = {p.exitcode for p in self._envs.processes} - {None}
+            raise ChildProcessError(
+                f"a worker process of {self.name} died (exit code {', '.join(map(str, codes))})"
+            ) from error
+
     def __enter__(self):
         return self
 
-    def __exit__(self, *_):
-        self._envs.close()
+    def __exit__(self, kind, *_):
+        # After an error a worker may be in the middle of a step, or gone.
+        self._envs.close(**({"terminate": True} if kind and self.num_workers > 1 else {}))

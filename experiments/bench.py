@@ -125,7 +125,7 @@ def bench_collection(repeats: int, num_envs: int = 16, horizon: int = 50) -> Non
 
         with ParallelEnvs(name, num_envs) as envs:
             envs.reset(0)
-            t = in_turn({"play": lambda: run.play(envs, policy, horizon), "raw": raw}, repeats)
+            t = in_turn({"play": lambda: run.rollout(envs, policy, horizon), "raw": raw}, repeats)
         rate, raw_rate = num_envs * horizon / t["play"], horizon / t["raw"]
         ratio = np.median(rate) / (cores * np.median(raw_rate))
         print(
@@ -176,7 +176,9 @@ def bench_priorities(repeats: int, heads: int = 16) -> None:
 def cycle_seconds(cycles: int, **settings) -> dict[str, float]:
     """Seconds a cycle and an evaluation take, from a short real run."""
     with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as null:
-        config = run.Config(**settings, epochs=1, cycles=cycles, eval_episodes=16, out=folder)
+        config = run.Config(
+            **settings, epochs=1, cycles=cycles, eval_episodes=16, out=f"{folder}/run"
+        )
         with redirect_stdout(null):
             (row,) = run.train(config)
     # the warm-up is not in collect_seconds; evaluation here is a tenth of an epoch's
