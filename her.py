@@ -77,6 +77,7 @@ def relabel_future(
         (Appendix B) is the ratio k/(1+k) = 0.8; nothing is stored k times.
     reward_fn: Eq. (1), vectorised: (B, G) achieved and (B, G) desired goals -> (B,) of -1 and 0.
     Gives obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,), hindsight (B,) bool.
+    FloatingPointError for a reward that is NaN or Inf.
     """
     n, horizon = episodes["action"].shape[:2]
     achieved = episodes["achieved_goal"]
@@ -85,12 +86,15 @@ def relabel_future(
     hindsight = rng.random(batch_size) < relabel_ratio
     future = rng.integers(t + 1, horizon + 1)  # t' ~ U{t+1, ..., T}, the same episode
     goal = np.where(hindsight[:, None], achieved[e, future], episodes["desired_goal"][e])
+    # r(s, a, g) asks whether the action led to the goal, so it reads the NEXT achieved goal.
+    reward = np.asarray(reward_fn(achieved[e, t + 1], goal), dtype=np.float32)
+    if not np.isfinite(reward).all():
+        raise FloatingPointError("NaN or Inf in the rewards")
     return {
         "obs": episodes["obs"][e, t],
         "action": episodes["action"][e, t],
         "next_obs": episodes["obs"][e, t + 1],  # with the same goal as obs
         "goal": goal,
-        # r(s, a, g) asks whether the action led to the goal, so it reads the NEXT achieved goal.
-        "reward": np.asarray(reward_fn(achieved[e, t + 1], goal), dtype=np.float32),
+        "reward": reward,
         "hindsight": hindsight,
     }

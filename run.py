@@ -276,7 +276,8 @@ def main(argv: list[str] | None = None) -> None:
     except UsageError as error:
         options.fail(str(error))
     except (FloatingPointError, OSError) as error:
-        sys.exit(f"run.py: stopped: {error}; {how_on}")
+        epoch = len(records.read_rows(Path(config.out))) + 1
+        sys.exit(f"run.py: stopped in epoch {epoch}: {error}; {how_on}")
     except KeyboardInterrupt:
         print(f"\nstopped; {how_on}")
         sys.exit(130)

@@ -197,7 +197,7 @@ def test_a_full_disk_stops_the_run_and_keeps_the_last_epoch(whole, tmp_path):
     run.main([*ARGUMENTS, "--epochs=1", f"--out={folder}"])
     code, _, err = finish(start(f"--resume={folder}", "--epochs=4", limit=1_000_000))
     assert code == 1 and err.count("\n") == 1, err
-    assert "stopped" in err and "--resume" in err
+    assert "stopped in epoch 2: " in err and "--resume" in err
     assert len(read_rows(folder)) == 1 and not list(folder.glob("*.tmp"))
     run.main([f"--resume={folder}", "--epochs=4"])
     assert_same_run(whole, folder)
@@ -275,7 +275,21 @@ class Broken(envs_point.PointMass):
         return obs, *rest
 
 
+class BrokenReward(envs_point.PointMass):
+    """Gives a NaN for goals far to the right."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        reward = super().compute_reward(achieved_goal, desired_goal, info)
+        return np.where(np.asarray(achieved_goal)[..., 0] > 0.5, np.nan, reward)
+
+    def reset(self, **kwargs):
+        super().reset(**kwargs)
+        self._xy = self._goal = (0.3, 0.0)
+        return self._observe(), {}
+
+
 gym.register("Broken-v0", Broken, max_episode_steps=10)
+gym.register("BrokenReward-v0", BrokenReward, max_episode_steps=50)
 
 
 def test_a_nan_stops_the_run_and_says_where(tmp_path):
@@ -283,6 +297,9 @@ def test_a_nan_stops_the_run_and_says_where(tmp_path):
     with pytest.raises(FloatingPointError, match="obs of an episode"):
         run.train(Config(**settings))
     assert threading.active_count() == 1
+    settings = {**SMALL, "env": "BrokenReward-v0", "out": str(tmp_path / "reward"), "epochs": 1}
+    with pytest.raises(FloatingPointError, match="in the rewards"):
+        run.train(Config(**settings))
     settings = {**SMALL, "out": str(tmp_path / "lr"), "epochs": 1, "learning_rate": 1e30}
     with pytest.raises(FloatingPointError, match="variance of the Q-values"):
         run.train(Config(**settings))

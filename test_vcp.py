@@ -23,6 +23,9 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from torch import nn
 
 import envs_point
@@ -207,7 +210,88 @@ def test_in_thread_runs_beside_the_block_and_passes_errors_on():
         time.sleep(0.05)
 
 
+@given(
+    variance=arrays(np.float64, st.integers(1, 50), elements=st.floats(0, 1e4)),
+    temperature=st.floats(0.5, 30),
+)
+def test_any_variances_give_probabilities_in_their_opposite_order(variance, temperature):
+    p = value_consistency_priority(variance, temperature)
+    assert np.all(p >= 0) and abs(p.sum() - 1) < 1e-9
+    assert np.all(np.diff(p[np.argsort(variance)]) <= 0)
+    assert p[variance == variance.min()].min() >= 1 / len(p) - 1e-9
+
+
+@given(
+    capacity=st.integers(1, 12),
+    sizes=st.lists(st.integers(1, 12), min_size=1, max_size=8),
+    temperature=st.floats(0.5, 30),
+)
+def test_any_ring_keeps_the_newest_and_draws_only_those(capacity, sizes, temperature):
+    buffer, stored = HERBuffer(capacity, temperature), []
+    for size in sizes:
+        values = np.arange(len(stored), len(stored) + min(size, capacity))
+        buffer.add(transitions(values), values % 5 * 0.1)
+        stored += values.tolist()
+    kept = stored[-capacity:]
+    assert buffer.size == len(kept)
+    assert sorted(buffer.data["obs"][: buffer.size, 0]) == kept
+    buffer.update_priorities()
+    batch = buffer.sample(20, np.random.default_rng(0))
+    assert set(batch["obs"][:, 0]) <= set(kept)
+    assert abs(batch["weight"].mean() - 1) < 1e-5
+    again = HERBuffer(capacity, temperature)
+    again.load_state_dict(copy.deepcopy(buffer.state_dict()))
+    for b in (buffer, again):
+        b.add(transitions([1000]), np.array([0.0]))
+        b.update_priorities()
+    np.testing.assert_array_equal(again.probabilities, buffer.probabilities)
+    for name, rows in buffer.data.items():
+        np.testing.assert_array_equal(again.data[name][: buffer.size], rows[: buffer.size])
+
+
 # ---------------------------------------------------------------------------------- her
+
+
+@given(
+    n=st.integers(1, 6),
+    horizon=st.integers(1, 12),
+    size=st.integers(1, 50),
+    ratio=st.floats(0, 1),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_relabelling_of_any_episodes(n, horizon, size, ratio, seed):
+    rng = np.random.default_rng(seed)
+    batch = relabel_future(numbered_episodes(n, horizon), size, rng, ratio, exact_reward)
+    e, t = (batch["obs"] / 10).astype(int).T
+    assert np.all((0 <= e) & (e < n) & (0 <= t) & (t < horizon))
+    relabelled = batch["hindsight"]
+    goal_episode, future = batch["goal"].T
+    assert np.all(goal_episode[relabelled] == e[relabelled])
+    assert np.all((t < future)[relabelled] & (future <= horizon)[relabelled])
+    assert np.all(batch["goal"][~relabelled] == -1)
+    reached = (batch["next_obs"] == 10 * batch["goal"]).all(axis=1)
+    np.testing.assert_array_equal(batch["reward"], reached - 1.0)
+
+
+@given(capacity=st.integers(1, 60), horizon=st.integers(1, 20), adds=st.lists(st.integers(1, 5)))
+def test_any_episode_buffer_holds_whole_episodes(capacity, horizon, adds):
+    if capacity < horizon:
+        with pytest.raises(ValueError):
+            EpisodeBuffer(capacity, horizon, 2, 2, 2)
+        return
+    buffer, added = EpisodeBuffer(capacity, horizon, 2, 2, 2), 0
+    episodes = numbered_episodes(len(adds) * 5 + 1, horizon)
+    for new in adds:
+        if new > buffer.capacity:
+            continue
+        some = {name: x[added : added + new] for name, x in episodes.items()}
+        buffer.add(some, np.random.default_rng(added))
+        added += new
+        ids = buffer.episodes["achieved_goal"][:, 0, 0].astype(int)
+        assert buffer.size == min(added, buffer.capacity) == len(set(ids))
+        assert set(range(added - new, added)) <= set(ids)
+        for name, x in buffer.episodes.items():
+            np.testing.assert_array_equal(x, episodes[name][ids])
 
 
 def test_future_relabelling_draws_later_steps_of_the_same_episode():
