@@ -5,10 +5,12 @@ import importlib.util
 import math
 import sys
 from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
 from typing import NoReturn, get_args
 
 import torch
 
+import records
 from envs_point import UsageError
 from vcp import IMPORTANCE, PRIORITIES
 
@@ -89,6 +91,14 @@ def complete(config: Config) -> Config:
         raise UsageError("--tensorboard: the package is missing (pip install tensorboard)")
     config.out = config.out or f"runs/{config.env}/{config.method}/seed{config.seed}"
     return config
+
+
+def load(folder: Path) -> Config:
+    """The settings of the run in `folder`. UsageError if it holds none, or another version's."""
+    try:
+        return Config(**records.read_config(folder))
+    except TypeError as error:
+        raise UsageError(f"{folder} holds a run of another version ({error})") from error
 
 
 def changed(saved: Config, given: dict) -> Config:

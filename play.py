@@ -12,7 +12,7 @@ from tqdm import tqdm
 import options
 import records
 from envs_point import UsageError, make_env
-from run import Config, act, make_agent, rollout
+from run import act, make_agent, rollout
 from workers import ParallelEnvs
 
 EPISODES = 10  # of each head
@@ -25,7 +25,7 @@ def play(folder: Path, gif: str | None = None) -> np.ndarray:
     and show SHOWN episodes of the best head: in a window where there is a display, or as the
     animation `gif`. Gives the success rate of each head, (K,). UsageError if nothing was learned
     yet, or for pictures that cannot be drawn."""
-    config = options.complete(Config(**records.read_config(folder)))
+    config = options.complete(options.load(folder))
     saved = records.load_checkpoint(folder)
     if saved is None:
         raise UsageError(f"the run in {folder} has no whole epoch yet")
@@ -59,6 +59,8 @@ def play(folder: Path, gif: str | None = None) -> np.ndarray:
         # what MuJoCo's renderers raise without a display or a driver
         hint = "without a display, set MUJOCO_GL=egl (a GPU's driver) or osmesa (libosmesa6)"
         raise UsageError(f"cannot draw {config.env} ({error}); {hint}") from error
+    except OSError as error:
+        raise UsageError(f"cannot write {gif}: {error.strerror or error}") from error
     finally:
         env.close()
     return rates

@@ -104,6 +104,11 @@ def read_rows(folder: Path) -> list[dict[str, float]]:
         return [{name: float(x) for name, x in row.items()} for row in csv.DictReader(file)]
 
 
+def epochs_done(folder: Path) -> int:
+    """How many whole epochs progress.csv has; 0 if it is not there yet."""
+    return len(read_rows(folder)) if (folder / "progress.csv").exists() else 0
+
+
 def save_checkpoint(folder: Path, state: dict) -> None:
     """checkpoint.pt, keeping the one before it. state: tensors and plain Python alone."""
 

@@ -268,19 +268,19 @@ def main(argv: list[str] | None = None) -> None:
             return
         config = Config(**given)
         if command.resume:
-            saved = Config(**records.read_config(Path(command.resume)))
+            saved = options.load(Path(command.resume))
             config = options.changed(saved, {**given, "out": command.resume})
         config = options.complete(config)
-        how_on = f"the last whole epoch is kept: python run.py --resume {config.out}"
-        train(config, resume=bool(command.resume))
+        try:
+            train(config, resume=bool(command.resume))
+        except (FloatingPointError, OSError, KeyboardInterrupt) as error:
+            epoch = records.epochs_done(Path(config.out)) + 1
+            reason = f": {error}" if str(error) else ""
+            print(f"run.py: stopped in epoch {epoch}{reason}", file=sys.stderr, end="; ")
+            print(f"to go on: python run.py --resume {config.out}", file=sys.stderr)
+            sys.exit(130 if isinstance(error, KeyboardInterrupt) else 1)
     except UsageError as error:
         options.fail(str(error))
-    except (FloatingPointError, OSError) as error:
-        epoch = len(records.read_rows(Path(config.out))) + 1
-        sys.exit(f"run.py: stopped in epoch {epoch}: {error}; {how_on}")
-    except KeyboardInterrupt:
-        print(f"\nstopped; {how_on}")
-        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -254,10 +254,10 @@ def test_nothing_is_left_running(sent, tmp_path):
         os.killpg(process.pid, sent)  # a terminal's Ctrl-C goes to the whole group
     else:
         process.send_signal(sent)
-    code, out, err = finish(process)
+    code, _, err = finish(process)
     assert gone(workers)
     if sent == signal.SIGINT:
-        assert code == 130 and f"--resume {folder}" in out and "Traceback" not in err, err
+        assert code == 130 and f"--resume {folder}" in err and "Traceback" not in err, err
     if sent == "worker":
         assert code == 1 and "died (exit code -9" in err and "PointMassEmptyEnv-v1" in err
         assert "Traceback" not in err
@@ -347,6 +347,7 @@ BAD = [
     ("--out full/config.json/below", "cannot write"),
     ("--resume nowhere", "does not hold a run"),
     ("--resume broken", "does not hold a run"),
+    ("--resume older", "another version"),
     ("--play nowhere", "does not hold a run"),
     ("--play full", "no whole epoch"),
     ("--gif a.gif", "--gif goes with --play"),
@@ -357,7 +358,8 @@ BAD = [
 @pytest.mark.parametrize(("arguments", "message"), BAD, ids=[b[0] for b in BAD])
 def test_bad_input_gets_one_line_and_exit_code_2(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    for name, text in (("full", json.dumps({"config": SMALL})), ("broken", "{")):
+    older = json.dumps({"config": {"no_such_setting": 1}})
+    for name, text in (("full", json.dumps({"config": SMALL})), ("broken", "{"), ("older", older)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").write_text(text)
     before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}

@@ -115,8 +115,9 @@ class HERBuffer:
 
     def load_state_dict(self, state: dict) -> None:
         rows = {name: x.numpy() for name, x in state["rows"].items()}
+        variance = rows.pop("variance")
         self.data, self.size, self._next = {}, 0, 0
-        self.add(rows, rows.pop("variance"))
+        self.add(rows, variance)
         self._next = state["next"]
         self.update_priorities()
 
