@@ -15,11 +15,8 @@ import subprocess
 from importlib.metadata import version
 from pathlib import Path
 
-import matplotlib
 import torch
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 
 from envs_point import UsageError
 
@@ -150,7 +147,8 @@ def add_to_tensorboard(folder: Path, row: dict) -> None:
 
 def _draw_curve(folder: Path, rows: list[dict], config: dict) -> None:
     epochs = [row["epoch"] for row in rows]
-    fig, ax = plt.subplots(figsize=(6, 3.6), layout="constrained")
+    fig = Figure(figsize=(6, 3.6), layout="constrained")
+    ax = fig.subplots()
     for column, label, style in (
         ("test_success_rate", "test, no noise", "o-"),
         ("train_success_rate", "training, with exploration", ":"),
@@ -162,7 +160,6 @@ def _draw_curve(folder: Path, rows: list[dict], config: dict) -> None:
     ax.legend(loc="lower right")
     ax.grid(alpha=0.3)
     write_whole(folder / "curve.png", lambda file: fig.savefig(file, dpi=110, format="png"))
-    plt.close(fig)
 
 
 def _commit() -> str | None:
