@@ -921,17 +921,24 @@ def test_reading_joints_by_index_changes_nothing(name):
             np.testing.assert_array_equal(a[key], b[key])
 
 
-def test_play_reads_success_at_the_last_step():
+def test_success_is_read_at_the_last_step():
+    step = itertools.count()
+
+    def to_the_goal(obs, goal):
+        return (goal - obs) / 0.05
+
+    def there_and_away_again(obs, goal):
+        return to_the_goal(obs, goal) if next(step) < 40 else -np.sign(goal)
+
     with ParallelEnvs("PointMassEmptyEnv-v1", 16, 1) as envs:
         envs.reset(0)
-        episodes, success = run.rollout(envs, lambda obs, goal: (goal - obs) / 0.05, 50)
+        episodes, success = run.rollout(envs, to_the_goal, 50)
         assert success.all()
-        start = np.linalg.norm(episodes["obs"][:, 0] - episodes["desired_goal"], axis=1)
-        away = np.where(start[:, None] < 9, 1.0, 0.0) * [[1.0, 1.0]]
-        _, success = run.rollout(envs, lambda obs, goal: np.where(obs < goal, -1, 1) * away, 50)
-        assert not success.any()
         assert episodes["obs"].shape == (16, 51, 2) and episodes["action"].shape == (16, 50, 2)
         np.testing.assert_array_equal(episodes["obs"], episodes["achieved_goal"])
+        episodes, success = run.rollout(envs, there_and_away_again, 50)
+        reached = np.linalg.norm(episodes["obs"][:, 40] - episodes["desired_goal"], axis=1)
+        assert np.all(reached < 0.05) and not success.any()
 
 
 def test_exploration_noise():
