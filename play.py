@@ -16,7 +16,7 @@ from run import act, make_agent, rollout
 from workers import ParallelEnvs
 
 EPISODES = 10  # of each head
-SHOWN = 4  # of the best head
+SHOWN = 3  # of the best head
 SEED = 1_000_000
 
 
@@ -52,7 +52,8 @@ def play(folder: Path, gif: str | None = None) -> np.ndarray:
             show(env, agent, best)
         elif gif:
             frames = show(env, agent, best)
-            images = [Image.fromarray(f).resize((240, 240)).quantize(64) for f in frames]
+            octree = Image.Quantize.FASTOCTREE  # keeps the colour of something as small as a goal
+            images = [Image.fromarray(f).resize((240, 240)).quantize(64, octree) for f in frames]
             images[0].save(gif, save_all=True, append_images=images[1:], duration=60, loop=0)
             print(f"{gif}: {SHOWN} episodes, {os.path.getsize(gif) // 1024} KB")
     except (AttributeError, ImportError, gym.error.DependencyNotInstalled) as error:
@@ -72,8 +73,8 @@ def show(env: gym.Env, agent, head: int) -> list[np.ndarray]:
     for episode in range(SHOWN):
         obs, _ = env.reset(seed=SEED + episode)
         for t in range(env.spec.max_episode_steps):
+            if env.render_mode == "rgb_array" and t % 2 == 0:
+                frames.append(env.render())
             rows = obs["observation"][None, None], obs["desired_goal"][None, None]
             obs, *_ = env.step(agent.act(*rows, slice(head, head + 1))[0, 0])
-            if env.render_mode == "rgb_array" and t % 2:
-                frames.append(env.render())
     return frames

@@ -727,6 +727,18 @@ def test_point_mass_renders_and_is_seeded(name):
     assert not np.array_equal(first["desired_goal"], other["desired_goal"])
 
 
+@pytest.mark.parametrize("name", ["PointMassEmptyEnv-v1", "PointMassWallEnv-v1"])
+def test_point_mass_takes_50_000_steps_a_second(name):
+    env = make_env(name)
+    actions = np.random.default_rng(0).uniform(-1, 1, (50, 2)).astype(np.float32)
+    start = time.perf_counter()
+    for _ in range(200):
+        env.reset()
+        for action in actions:
+            env.step(action)
+    assert 200 * 50 / (time.perf_counter() - start) > 50_000
+
+
 def distance_to_wall(xy):
     """From points (N, 2) to the wall's axis, the segment from (-inf, 0) to (0.2, 0)."""
     nearest_x = np.minimum(xy[:, 0], 0.2)
@@ -1056,6 +1068,14 @@ def test_an_environment_from_outside_trains(tmp_path):
     assert row["env_steps"] == 3 * 16 * 7
 
 
+def test_a_module_and_its_id_name_an_environment(tmp_path, monkeypatch):
+    text = "import gymnasium, test_vcp\n"
+    text += "gymnasium.register('Own-v0', test_vcp.Tracker, max_episode_steps=5)\n"
+    (tmp_path / "own_module.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert make_env("own_module:Own-v0").spec.max_episode_steps == 5
+
+
 @pytest.mark.parametrize("name", PAPER_ENVS)
 def test_one_cycle_of_each_of_the_sixteen(name):
     """Collect, relabel, score, update: shapes, rewards, episode length."""
@@ -1089,10 +1109,8 @@ def test_one_cycle_of_each_of_the_sixteen(name):
     update_her_buffer(original, buffer, agent, 256, rng, 0.8, reward_fn)
     rewards = buffer.data["reward"]
     assert set(np.unique(rewards)) == {-1.0, 0.0} and rewards.dtype == np.float32
-    # relabelled with the own next achieved goal: reached, 7 % of the draws
-    assert np.all(rewards[(buffer.data["hindsight"])].mean() > -1)
-    losses = agent.update_head(1, buffer.sample(64, rng))
-    assert torch.isfinite(losses).all()
+    for k in range(2):
+        assert torch.isfinite(agent.update_head(k, buffer.sample(64, rng))).all()
 
 
 def command(*arguments, cwd):

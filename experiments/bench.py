@@ -224,7 +224,7 @@ def main() -> None:
     if quick:
         bench_epochs(1, 1, [16])
     else:
-        bench_epochs(4, 3, list(PAPER_MINUTES))
+        bench_epochs(2, 2, list(PAPER_MINUTES))
 
 
 if __name__ == "__main__":
