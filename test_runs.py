@@ -7,6 +7,7 @@ aside, and the same weights.
 import importlib.util
 import json
 import math
+import multiprocessing
 import os
 import random
 import re
@@ -124,6 +125,11 @@ def test_a_resumed_run_of_a_robot_equals_an_uninterrupted_one(tmp_path):
     for epochs, resume in ((1, False), (2, True)):
         run.train(Config(**settings, epochs=epochs, out=str(tmp_path / "parts")), resume)
     assert_same_run(tmp_path / "whole", tmp_path / "parts")
+    assert not multiprocessing.active_children() and threading.active_count() == 1
+    settings = {**settings, "env": "Broken-v0", "out": str(tmp_path / "broken")}
+    with pytest.raises(FloatingPointError):
+        run.train(Config(**settings))
+    assert not multiprocessing.active_children() and threading.active_count() == 1
 
 
 def test_resuming_from_the_command_line(whole, tmp_path, capsys):
