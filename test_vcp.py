@@ -979,7 +979,8 @@ def test_heads_act_in_their_own_environments():
     np.testing.assert_allclose(run.act(agent, obs, goal, 1), only_first, atol=1e-5)
 
 
-def test_train_does_what_algorithm_2_says(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("acting_head", "collecting"), [("all", (4, 4, 2)), ("one", (1, 16, 2))])
+def test_train_does_what_algorithm_2_says(acting_head, collecting, tmp_path, monkeypatch):
     """The calls, in order: the heads in turn, each with a mini-batch of its own; the targets once a
     cycle; Algorithm 1 before each round; the normaliser fed with every step."""
     calls, agents, goals = [], [], []
@@ -1009,13 +1010,14 @@ def test_train_does_what_algorithm_2_says(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "EnsembleDDPG", Spy)
     monkeypatch.setattr(run, "update_her_buffer", spy_algorithm_1)
     settings = {**SMALL, "cycles": 2, "updates": 3, "batch_size": 16, "heads": 4, "num_workers": 1}
+    settings |= {"acting_head": acting_head}
     (row,) = train(Config(**settings, env="PointMassEmptyEnv-v1", out=str(tmp_path / "run")))
     names = [call if isinstance(call, str) else call[0] for call in calls]
     assert names == 2 * (3 * ["algorithm 1", 0, 1, 2, 3] + ["targets"])
     batches = [call[1] for call in calls if not isinstance(call, str)]
     assert len(set(batches)) == len(batches)
-    # 4 heads have 4 environments each: warm-up, 2 cycles and 1 round of evaluation, 50 steps each
-    assert {g.shape for g in goals} == {(4, 4, 2)} and len(goals) == 4 * 50
+    # warm-up and 2 cycles, in 16 environments by 4 heads or one; then a round of evaluation, by all
+    assert [g.shape for g in goals] == 150 * [collecting] + 50 * [(4, 4, 2)]
     assert agents[0].normalizer.count == row["env_steps"] == 3 * 16 * 50
     assert len({g.tobytes() for g in goals}) == 4
 
