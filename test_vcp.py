@@ -1042,6 +1042,28 @@ def test_the_same_seed_gives_the_same_rows(tmp_path):
     assert [row["her_buffer_size"] for row in a] == [2 * 2 * 4 * 32, 2 * 2 * 2 * 4 * 32]
 
 
+def test_each_seed_and_epoch_has_random_numbers_of_its_own(tmp_path, monkeypatch):
+    resets, streams = [], []
+
+    class Spy(ParallelEnvs):
+        def reset(self, seed=None):
+            resets.extend([] if seed is None else [seed])
+            return super().reset(seed)
+
+    def spy(action, rng, *args):
+        streams.append(rng.bit_generator.state["state"]["state"])
+        return explore(action, rng, *args)
+
+    explore = run.explore
+    monkeypatch.setattr(run, "ParallelEnvs", Spy)
+    monkeypatch.setattr(run, "explore", spy)
+    settings = {**SMALL, "env": "PointMassEmptyEnv-v1", "epochs": 2, "num_workers": 1}
+    for seed in (0, 1):
+        train(Config(**settings, seed=seed, out=str(tmp_path / str(seed))))
+    assert len(resets) == len(set(resets)) == 2 * 2 * 2  # seeds, epochs, training and testing
+    assert len(streams) == len(set(streams)) == 2 * (3 + 2) * 50
+
+
 @pytest.mark.parametrize(
     "options",
     [
