@@ -215,7 +215,7 @@ def bench_epochs(cycles: int, repeats: int, head_counts: list[int]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="fewer repeats: under a minute")
+    parser.add_argument("--quick", action="store_true", help="fewer repeats: about a minute")
     quick = parser.parse_args().quick
     print(f"PyTorch {torch.__version__}, {torch.get_num_threads()} threads")
     bench_update(3 if quick else 20)
