@@ -198,7 +198,7 @@ class EnsembleDDPG:
             next_q = self.target_critic.forward(
                 self.target_critic.head(k), torch.cat([next_state, next_action], 1)
             )
-            # Rewards are -1 or 0, so every return lies in [-1/(1-γ), 0].
+            # Rewards are -1 or 0, so every return lies in [-1/(1-γ), 0] (not in the paper).
             target = (reward + self.gamma * next_q).clamp(-1 / (1 - self.gamma), 0)
 
         # Eq. (2): L(φ_k) = E[w (Q_k(s, a, g) - y)²]
@@ -220,9 +220,11 @@ class EnsembleDDPG:
     def update_targets(self) -> None:
         """θ̄ <- polyak·θ̄ + (1 - polyak)·θ, once a cycle FOR EACH HEAD's target network.
 
-        A head's network is its head and the trunk, so the trunk is averaged K times; the main trunk
-        stands still meanwhile, and K steps of 0.95 are one step of 0.95^K. With a single step for
-        the trunk learning is several times slower (NOTES.md, "the trunk's targets").
+        Not in the paper, which says 0.95 and that each head has its own target network; the
+        released code does so. A head's network is its head and the trunk, so the trunk is averaged
+        K times; the main trunk stands still meanwhile, and K steps of 0.95 are one step of 0.95^K.
+        With a single step for the trunk learning is several times slower (NOTES.md, "the trunk's
+        targets").
         """
         heads = len(self.optimizers)
         self._move_targets(trunk_step=1 - self.polyak**heads, head_step=1 - self.polyak)

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -25,7 +26,9 @@ def play(folder: Path, gif: str | None = None) -> np.ndarray:
     and show SHOWN episodes of the best head: in a window where there is a display, or as the
     animation `gif`. Gives the success rate of each head, (K,). UsageError if nothing was learned
     yet, or for pictures that cannot be drawn."""
-    config = options.complete(options.load(folder))
+    # A run from a GPU can be played without one.
+    config = replace(options.load(folder), device="auto", tensorboard=False)
+    config = options.complete(config)
     saved = records.load_checkpoint(folder)
     if saved is None:
         raise UsageError(f"the run in {folder} has no whole epoch yet")

@@ -151,7 +151,8 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     dims = [env.observation_space[name].shape[0] for name in ("observation", "desired_goal")]
     original_buffer = EpisodeBuffer(config.buffer_size, horizon, *dims, env.action_space.shape[0])
     her_buffer = HERBuffer(
-        capacity=batch_size * config.updates * heads,  # what a cycle draws
+        # what a cycle draws, and no less than Algorithm 1 stores at once
+        capacity=batch_size * max(config.updates * heads, config.scored_per_update),
         temperature=config.temperature,
         priority=config.priority,
         importance=config.importance,
@@ -281,6 +282,8 @@ def main(argv: list[str] | None = None) -> None:
             sys.exit(130 if isinstance(error, KeyboardInterrupt) else 1)
     except UsageError as error:
         options.fail(str(error))
+    except KeyboardInterrupt:  # while it plays
+        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import os
 import random
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -406,8 +407,10 @@ def test_help_names_every_option_and_default(capsys):
 
 
 def test_playing_a_run(whole, tmp_path, capsys):
-    picture = tmp_path / "a.gif"
-    rates = play(whole, str(picture))
+    folder, picture = tmp_path / "from_a_gpu", tmp_path / "a.gif"
+    shutil.copytree(whole, folder)
+    records.write_config(folder, {**records.read_config(whole), "device": "cuda"})
+    rates = play(folder, str(picture))
     out = capsys.readouterr().out
     assert rates.shape == (2,) and np.all((rates >= 0) & (rates <= 1))
     assert f"success {rates.mean():.3f} over 20 episodes" in out and "after epoch 4" in out

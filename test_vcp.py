@@ -1074,6 +1074,7 @@ def test_each_seed_and_epoch_has_random_numbers_of_its_own(tmp_path, monkeypatch
         {"acting_head": "one"},
         {"heads": 1},
         {"heads": 3, "temperature": 15.0},
+        {"heads": 1, "updates": 1, "scored_per_update": 4},
         {"her_thread": True},
         {"buffer_size": 800, "cycles": 4},
     ],

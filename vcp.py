@@ -44,7 +44,7 @@ PRIORITIES = {  # Section 5.6: the method and its two ablations
     "uniform": lambda variance, temperature: np.full(len(variance), 1 / len(variance)),
 }
 
-IMPORTANCE = {  # the loss weight of a drawn transition; all are scaled to mean 1 in the mini-batch
+IMPORTANCE = {  # the loss weight of a drawn transition; scaled to mean 1 in the mini-batch (ours)
     "paper": lambda p: p,  # Section 4.3, literally: w_i = p_i / Σ p
     "inverse": lambda p: 1 / p,  # Schaul et al. (2015b), β = 1: undoes the preference
     "none": np.ones_like,
@@ -55,7 +55,8 @@ class HERBuffer:
     """B_h of Figure 1(b): relabelled and original transitions, first in first out, each with the
     variance it was scored with and the probability to be drawn.
 
-    capacity: in transitions (not in the paper; the released code takes what a cycle draws).
+    Not in the paper: that the oldest go first, and the capacity, in transitions; the released code
+    takes what a cycle draws.
     A stored variance is not refreshed: it is as old as the transition's stay in the buffer.
     """
 
