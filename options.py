@@ -20,12 +20,15 @@ def option(default, text, choices=None):
     return field(default=default, metadata={"help": text, "choices": choices})
 
 
+METHODS = ["vcp", "her", "herebp", "cher", "dtgsh"]
+
+
 @dataclass
 class Config:
     """Every setting of a run. NOTES.md says which of them the paper gives, and where."""
 
     env: str = option("FetchReach-v1", "the paper's name, the id of a goal environment, module:ID")
-    method: str = option("vcp", "what to train", ["vcp"])
+    method: str = option("vcp", "what decides what is replayed", METHODS)
     seed: int = option(0, "of everything that is random")
     out: str | None = option(None, "the run's folder (default: runs/<env>/<method>/seed<seed>)")
     # The schedule, Appendix B; None is filled in by `paper_schedule`
@@ -41,6 +44,8 @@ class Config:
     importance: str = option("paper", "w_i: Section 4.3, Schaul et al., or 1", [*IMPORTANCE])
     acting_head: str = option("all", "the heads that collect, Section 5.6", ["all", "one"])
     her_thread: bool = option(False, "Algorithm 1 in a thread, as in the paper; not reproducible")
+    # The methods it is compared with
+    faithful: bool = option(False, "herebp, cher, dtgsh with their released code's flaws: NOTES.md")
     # The machine
     device: str = option("auto", "for the networks; auto: a GPU if any", ["auto", "cpu", "cuda"])
     num_workers: int | None = option(None, "processes for the environments (default: one a core)")
@@ -56,12 +61,17 @@ class Config:
     action_penalty: float = 1.0
 
 
+OF_VCP = ("temperature", "priority", "importance", "her_thread")  # of no other method
 MAY_CHANGE = ("epochs", "out", "device", "num_workers", "tensorboard")  # when a run is resumed
 
 
-def paper_schedule(env: str) -> dict[str, int]:
+def paper_schedule(env: str, method: str = "vcp") -> dict[str, int]:
     """Appendix B's n and batch size. Not in the paper: the number of updates, and how many
     mini-batches Algorithm 1 scores for one update of all heads."""
+    if method == "dtgsh":  # Appendix B: batch 64 everywhere, and as many transitions as the others
+        schedule = paper_schedule(env)
+        updates = schedule["updates"] * schedule["batch_size"] // 64
+        return {**schedule, "batch_size": 64, "updates": updates}
     if env.startswith("FetchReach"):
         return {"cycles": 5, "updates": 5, "batch_size": 64, "scored_per_update": 4}
     if env.startswith(("Reacher", "SparseReacher")):
@@ -72,13 +82,18 @@ def paper_schedule(env: str) -> dict[str, int]:
 def complete(config: Config) -> Config:
     """A copy with schedule, device and folder filled in. UsageError for a setting out of range."""
     given = {name: value for name, value in asdict(config).items() if value is not None}
-    config = Config(**{**paper_schedule(config.env), **given})
+    config = Config(**{**paper_schedule(config.env, config.method), **given})
     for f in fields(config):
         value, choices = getattr(config, f.name), f.metadata.get("choices")
         if choices and value not in choices:
             raise UsageError(f"{flag(f.name)} must be one of {', '.join(choices)}, not {value!r}")
         if type(value) is int and value < 1 and f.name != "seed":
             raise UsageError(f"{flag(f.name)} must be 1 or more, not {value}")
+    for name in OF_VCP if config.method != "vcp" else ():
+        if getattr(config, name) != getattr(Config, name):
+            raise UsageError(f"{flag(name)} goes with --method vcp, not with {config.method}")
+    if config.faithful and config.method in ("vcp", "her"):
+        raise UsageError(f"--faithful does not go with --method {config.method}")
     if config.seed < 0:
         raise UsageError(f"--seed must be 0 or more, not {config.seed}")
     if not math.isfinite(config.temperature):

@@ -25,7 +25,7 @@ import options
 import records
 from ensemble import EnsembleDDPG
 from envs_point import UsageError, describe, make_env
-from her import EpisodeBuffer, relabel_future
+from her import EpisodeBuffer, HERReplay, relabel_future
 from options import Config
 from vcp import HERBuffer, in_thread, update_her_buffer
 from workers import ParallelEnvs, one_torch_thread
@@ -128,6 +128,31 @@ def make_agent(config: Config, env: gym.Env) -> EnsembleDDPG:
     )
 
 
+def make_replay(config: Config, env: gym.Env, original_buffer: EpisodeBuffer, reward_fn):
+    """What Algorithm 2, line 15, draws from: B_h, or the replay of another `--method`."""
+    drawn = config.updates * config.heads  # mini-batches in a cycle
+    if config.method == "vcp":
+        return HERBuffer(
+            # what a cycle draws, and no less than Algorithm 1 stores at once
+            capacity=config.batch_size * max(drawn, config.scored_per_update),
+            temperature=config.temperature,
+            priority=config.priority,
+            importance=config.importance,
+        )
+    her = (original_buffer, config.relabel_ratio, reward_fn)
+    at_once = max(n for n in range(1, 41) if drawn % n == 0)
+    if config.method == "her":
+        return HERReplay(*her, at_once=at_once)
+    from baselines import cher, dtgsh, herebp
+
+    common = {"env_name": config.env, "faithful": config.faithful, "at_once": at_once}
+    if config.method == "herebp":
+        return herebp.HEREBP(*her, **common, dt=getattr(env.unwrapped, "dt", 1.0))
+    if config.method == "cher":
+        return cher.CHER(*her, **common, heads=config.heads, updates=config.cycles * config.updates)
+    return dtgsh.DTGSH(*her, **common)
+
+
 def train(config: Config, resume: bool = False) -> list[dict]:
     """Algorithm 2. Writes the run's folder and gives the rows of its progress.csv.
 
@@ -150,16 +175,12 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     agent = make_agent(config, env)
     dims = [env.observation_space[name].shape[0] for name in ("observation", "desired_goal")]
     original_buffer = EpisodeBuffer(config.buffer_size, horizon, *dims, env.action_space.shape[0])
-    her_buffer = HERBuffer(
-        # what a cycle draws, and no less than Algorithm 1 stores at once
-        capacity=batch_size * max(config.updates * heads, config.scored_per_update),
-        temperature=config.temperature,
-        priority=config.priority,
-        importance=config.importance,
-    )
 
     def reward_fn(achieved, desired):
         return env.unwrapped.compute_reward(achieved, desired, {})  # Eq. (1)
+
+    her_buffer = make_replay(config, env, original_buffer, reward_fn)
+    vcp = config.method == "vcp"
 
     def collect(random_actions):  # lines 3-11
         acting = heads if config.acting_head == "all" else 1
@@ -170,7 +191,9 @@ def train(config: Config, resume: bool = False) -> list[dict]:
             ),
             horizon,
         )
-        original_buffer.add(episodes, play_rng)  # line 9
+        slots = original_buffer.add(episodes, play_rng)  # line 9
+        if not vcp:
+            her_buffer.new_episodes(slots)
         # The normaliser sees what the networks will: relabelled goals too.
         size = num_envs * horizon
         seen = relabel_future(episodes, size, play_rng, config.relabel_ratio, reward_fn)
@@ -213,7 +236,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                 with timed(seconds, "train"):  # line 12, Training
                     with in_thread(algorithm_1) if config.her_thread else nullcontext():
                         for _ in range(config.updates):
-                            if not config.her_thread:
+                            if vcp and not config.her_thread:
                                 algorithm_1()  # line 13, at a fixed rate
                             for k in range(heads):  # line 14
                                 batch = her_buffer.sample(batch_size, draw_rng)  # line 15

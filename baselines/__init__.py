@@ -1,0 +1,1 @@
+"""The methods that the paper compares VCP with, each a replay to draw mini-batches from."""

@@ -1,0 +1,97 @@
+"""HEREBP: energy-based prioritization of hindsight experience (Zhao and Tresp, 2018).
+
+Episodes in which the object was given much energy are replayed more often; within an episode
+transitions and goals are drawn as in HER. Section 5.1 of the VCP paper compares with it.
+
+Letters in the shape comments:
+    N episodes    T steps of an episode    G goal    P points
+"""
+
+import numpy as np
+
+from her import Batch, HERReplay, future_goals, transitions
+
+GRAVITY = 9.81  # m/s²; masses are 1 kg and moments of inertia 1 kg·m²
+MOST_PER_STEP = {"Fetch": 0.5, "Hand": 2.5}  # J; the original's README, by the environment's name
+EPSILON = 1e-6  # J, so that episodes without any energy can be drawn too (ours)
+
+
+def rotation(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """The angle in radians, 0 to π, between orientations: unit quaternions (..., 4) -> (...).
+    q and -q are the same orientation, hence the absolute value."""
+    return 2 * np.arccos(np.minimum(abs((before * after).sum(axis=-1)), 1))
+
+
+def euler_angles(q: np.ndarray) -> np.ndarray:
+    """Roll, pitch and yaw in radians of unit quaternions (..., 4), w first -> (..., 3)."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.stack([roll, pitch, yaw], axis=-1)
+
+
+def trajectory_energy(
+    achieved_goal: np.ndarray, dt: float, most_per_step: float = np.inf, faithful: bool = False
+) -> np.ndarray:
+    """The energy in J that the object gained over each episode, losses not counted against gains.
+
+    achieved_goal: (N, T+1, G). What its numbers are follows from G: a multiple of 3 is points in
+        space (Fetch: 1, HandReach: 5 fingertips, whose energies are added), 7 a position and a
+        quaternion, anything else coordinates in a plane, which have no height.
+    dt: seconds between steps; most_per_step: what counts at most of one step's gain.
+    faithful: rotational energy from differences of Euler angles, as the original has it. They jump
+        by 2π where an angle passes ±π: 12,000 J at dt = 0.04.
+    """
+    x = np.asarray(achieved_goal, dtype=np.float64)
+    goal_dim = x.shape[-1]
+    pose = goal_dim == 7
+    position = x[..., :3] if pose else x
+    speed = np.diff(position, axis=1) / dt
+    energy = 0.5 * np.square(speed).sum(axis=-1)  # KE = ½ m |v|², (N, T)
+    if pose or goal_dim % 3 == 0:
+        height = position[..., 2::3]  # (N, T+1, P)
+        energy += GRAVITY * (height[:, 1:] - height[:, :1]).sum(axis=-1)  # PE = m g (z_t - z_0)
+    if pose:
+        q = x[..., 3:]
+        if faithful:
+            angle = np.diff(euler_angles(q), axis=1)
+        else:
+            angle = rotation(q[:, :-1], q[:, 1:])[..., None]
+        energy += 0.5 * np.square(angle / dt).sum(axis=-1)  # RE = ½ I |ω|²
+    gain = np.diff(energy, axis=1, prepend=0)  # ΔE_1 = E_1, ΔE_t = E_t - E_{t-1}
+    return np.clip(gain, 0, most_per_step).sum(axis=1)
+
+
+class HEREBP(HERReplay):
+    """Episodes are drawn with probability ∝ energy^(1/(temperature + 0.01)), transitions and goals
+    in them as in HER. The energy is computed once, when an episode is stored.
+
+    dt, faithful: as in `trajectory_energy`.
+    """
+
+    def __init__(self, *her, env_name: str, dt: float, temperature=1.0, faithful=False, **at_once):
+        super().__init__(*her, **at_once)
+        most_per_step = next(
+            (m for k, m in MOST_PER_STEP.items() if env_name.startswith(k)), np.inf
+        )
+        self.settings = (dt, most_per_step, faithful)
+        self.exponent = 1 / (temperature + 0.01)
+        self.energy = np.zeros(self.buffer.capacity)
+        self.cumulative = np.empty(0)
+
+    def new_episodes(self, slots: np.ndarray) -> None:
+        super().new_episodes(slots)
+        achieved = self.buffer.episodes["achieved_goal"][slots]
+        self.energy[slots] = trajectory_energy(achieved, *self.settings)
+        priority = (self.energy[: self.buffer.size] + EPSILON) ** self.exponent
+        cumulative = priority.cumsum()
+        self.cumulative = cumulative / cumulative[-1]
+
+    def draw(self, count: int, batch_size: int, rng: np.random.Generator) -> Batch:
+        episodes, size = self.buffer.episodes, count * batch_size
+        # Inverse transform sampling: the first e with p_1 + ... + p_e > u.
+        e = np.searchsorted(self.cumulative, rng.random(size), side="right")
+        t = rng.integers(episodes["action"].shape[1], size=size)
+        goal, hindsight = future_goals(episodes, e, t, rng, self.relabel_ratio)
+        return transitions(episodes, e, t, goal, hindsight, self.reward_fn)
