@@ -19,11 +19,19 @@ import run
 from ensemble import HIDDEN, EnsembleDDPG
 from envs_point import make_env
 from her import EpisodeBuffer
-from vcp import HERBuffer, update_her_buffer
+from options import METHODS, complete
+from vcp import update_her_buffer
 from workers import ParallelEnvs, available_cores
 
 SIZES = {"FetchReach-v1": (10, 3, 4), "FetchPush-v1": (25, 3, 4), "HandReach-v0": (63, 15, 20)}
 PAPER_MINUTES = {2: 3.2, 4: 5.6, 8: 8.5, 16: 12.0, 32: 20.7}  # Table 2, HandReach
+PAPER_METHODS = {  # Tables 1 and 3, HandReach: minutes with one network, with the ensemble
+    "vcp": (12.0, 12.0),
+    "her": (1.5, 9.3),
+    "herebp": (2.74, 11.0),
+    "cher": (8.2, 60.5),
+    "dtgsh": (34.1, 253.0),
+}
 
 
 def in_turn(functions: dict[str, Callable], repeats: int) -> dict[str, np.ndarray]:
@@ -133,26 +141,43 @@ def bench_collection(repeats: int, num_envs: int = 16, horizon: int = 50) -> Non
         )
 
 
+def full_buffer(name: str, rng: np.random.Generator, transitions: int = 100_000) -> EpisodeBuffer:
+    """B_o with random observations and achieved goals that walk at random."""
+    obs_dim, goal_dim, action_dim = SIZES[name]
+    buffer = EpisodeBuffer(transitions, 50, obs_dim, goal_dim, action_dim)
+    n = buffer.capacity
+    walk = rng.normal(0, 0.01, (n, 51, goal_dim)).cumsum(axis=1)
+    episodes = {
+        "obs": rng.normal(size=(n, 51, obs_dim)),
+        "achieved_goal": walk + rng.uniform(-0.15, 0.15, (n, 1, goal_dim)),
+        "desired_goal": rng.uniform(-0.15, 0.15, (n, goal_dim)),
+        "action": rng.uniform(-1, 1, (n, 50, action_dim)),
+    }
+    buffer.add({k: x.astype(np.float32) for k, x in episodes.items()}, rng)
+    return buffer
+
+
+def replay_of(config: run.Config, original: EpisodeBuffer):
+    """What the run would draw from, and its reward function."""
+    env = make_env(config.env)
+
+    def reward_fn(achieved, desired):
+        return env.unwrapped.compute_reward(achieved, desired, {})
+
+    return run.make_replay(config, env, original, reward_fn), reward_fn
+
+
 def bench_priorities(repeats: int, heads: int = 16) -> None:
     print("\n3. Scoring, Eq. (4) and sampling with B_h full, as a share of a cycle's training")
     print(f"{'sizes of':14} {'scored':>8} {'score+Eq.(4) ms':>22} {'sample ms':>22} {'share':>6}")
     for name in ("FetchPush-v1", "HandReach-v0"):
-        obs_dim, goal_dim, action_dim = SIZES[name]
         batch, rng = 256, np.random.default_rng(0)
-        agent = EnsembleDDPG(obs_dim, goal_dim, action_dim, gamma=0.98, heads=heads)
-        env = make_env(name)
-        original = EpisodeBuffer(100_000, 50, obs_dim, goal_dim, action_dim)
-        n = original.capacity
-        shapes = {"obs": (51, obs_dim), "achieved_goal": (51, goal_dim)}
-        shapes |= {"desired_goal": (goal_dim,), "action": (50, action_dim)}
-        original.add({k: rng.normal(size=(n, *s)).astype("f4") for k, s in shapes.items()}, rng)
-        her_buffer = HERBuffer(40 * heads * batch, 9.0)
+        agent = EnsembleDDPG(*SIZES[name], gamma=0.98, heads=heads)
+        original = full_buffer(name, rng)
+        her_buffer, reward_fn = replay_of(complete(run.Config(env=name, heads=heads)), original)
 
-        def score(size, agent=agent, env=env, original=original, her_buffer=her_buffer, rng=rng):
-            def reward_fn(achieved, desired):
-                return env.unwrapped.compute_reward(achieved, desired, {})
-
-            update_her_buffer(original, her_buffer, agent, size, rng, 0.8, reward_fn)
+        def score(size, agent=agent, buffers=(original, her_buffer), rng=rng, reward_fn=reward_fn):
+            update_her_buffer(*buffers, agent, size, rng, 0.8, reward_fn)
 
         while her_buffer.size < her_buffer.capacity:
             score(10 * batch)
@@ -213,6 +238,57 @@ def bench_epochs(cycles: int, repeats: int, head_counts: list[int]) -> None:
         print(f"   {heads:5} {t['cycle']:8.2f} {minutes:10.1f} {PAPER_MINUTES[heads]:16.1f}")
 
 
+def bench_draws(repeats: int, heads: int = 16) -> None:
+    print("\n6. Drawing a mini-batch by the other methods, and its share of the update it feeds")
+    print(f"{'sizes of':14} {'batch':>5} {'method':8} {'draw ms':>22} {'share':>6}")
+    for name in SIZES:
+        rng = np.random.default_rng(0)
+        original = full_buffer(name, rng)
+        agent = EnsembleDDPG(*SIZES[name], gamma=0.98, heads=heads)
+        for batch in (64, 256):
+            replays, calls = {}, 40
+            for method in METHODS[1:] if batch == 64 else METHODS[1:-1]:  # DTGSH: 64 alone
+                config = complete(run.Config(env=name, method=method, batch_size=batch))
+                replays[method], _ = replay_of(config, original)
+                replays[method].new_episodes(np.arange(original.size))
+            data = random_batch(batch, *SIZES[name])
+            functions = {
+                method: lambda r=r, batch=batch: [r.sample(batch, rng) for _ in range(calls)]  # noqa: B023
+                for method, r in replays.items()
+            }
+            functions["update"] = lambda data=data: [
+                agent.update_head(k % heads, data)  # noqa: B023
+                for k in range(calls)  # noqa: B023
+            ]
+            t = in_turn(functions, repeats)
+            update = np.median(t.pop("update"))
+            for method, x in t.items():
+                print(
+                    f"{name:14} {batch:5} {method:8} {spread(x / calls, 1e3, 2):>22}"
+                    f" {np.median(x) / update:6.1%}"
+                )
+
+
+def bench_methods(cycles: int) -> None:
+    print("\n7. Minutes an epoch of every method, HandReach, and the ratio to VCP")
+    print("              one network   paper's Table 1        16 heads   paper's Table 3")
+    seconds = {
+        (method, heads): cycle_seconds(cycles, env="HandReach-v0", method=method, heads=heads)
+        for heads in (1, 16)
+        for method in METHODS
+        if (method, heads) != ("vcp", 1)
+    }
+    minutes = {k: (50 * t["cycle"] + 10 * t["eval"]) / 60 for k, t in seconds.items()}
+    vcp = minutes["vcp", 16]
+    for method, paper in PAPER_METHODS.items():
+        ours = (minutes.get((method, 1), vcp), minutes[method, 16])
+        columns = (
+            f"{x:8.2f} ({x / vcp:5.2f}) {p:8.2f} ({p / 12:5.2f})"
+            for x, p in zip(ours, paper, strict=True)
+        )
+        print(f"{method:8}", *columns)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--quick", action="store_true", help="fewer repeats: about a minute")
@@ -221,10 +297,12 @@ def main() -> None:
     bench_update(3 if quick else 20)
     bench_collection(2 if quick else 10)
     bench_priorities(2 if quick else 15)
+    bench_draws(2 if quick else 10)
     if quick:
         bench_epochs(1, 1, [16])
     else:
         bench_epochs(2, 2, list(PAPER_MINUTES))
+        bench_methods(2)
 
 
 if __name__ == "__main__":
