@@ -13,7 +13,7 @@ from tqdm import tqdm
 import options
 import records
 from envs_point import UsageError, make_env
-from run import act, make_agent, rollout
+from run import actor, make_agent, rollout
 from workers import ParallelEnvs
 
 EPISODES = 10  # of each head
@@ -40,10 +40,10 @@ def play(folder: Path, gif: str | None = None) -> np.ndarray:
 
     heads, horizon = config.heads, env.spec.max_episode_steps
     successes = []
-    with ParallelEnvs(config.env, heads, config.num_workers) as envs:
+    with ParallelEnvs(config.env, heads, config.num_workers, heads) as envs:
         envs.reset(SEED)
         for _ in tqdm(range(EPISODES), leave=False, disable=None):
-            successes.append(rollout(envs, lambda o, g: act(agent, o, g, heads), horizon)[1])
+            successes.append(rollout(envs, actor(agent, heads, heads), horizon)[1])
     rates = np.mean(successes, axis=0)  # (K,)
     best = int(rates.argmax())
     print(

@@ -36,26 +36,34 @@ tqdm.monitor_interval = 0  # its watching thread would outlive a run
 def rollout(envs: ParallelEnvs, policy, horizon: int) -> tuple[dict, np.ndarray]:
     """Algorithm 2, lines 4-11: an episode in each environment, all at once.
 
-    policy: (N, O) observations and (N, G) goals -> (N, A) actions in [-1, 1].
+    policy: step t, the rows of some of the N environments as a slice, their observations (n, O) and
+    goals (n, G) -> their actions (n, A) in [-1, 1]. The workers ask at their own pace.
     Gives the episodes, with the arrays of her.EpisodeBuffer, and is_success at the last step, (N,).
     """
-    steps, actions = [envs.reset()], []  # line 5
-    goal = steps[0]["desired_goal"]
-    with one_torch_thread():
-        for _ in range(horizon):  # line 6
-            actions.append(np.float32(policy(steps[-1]["observation"], goal)))  # line 7
-            obs, success = envs.step(actions[-1])  # line 8
+
+    def play(worker):
+        steps, actions = [worker.reset()], []  # line 5
+        goal = steps[0]["desired_goal"]
+        for t in range(horizon):  # line 6
+            obs = steps[-1]["observation"]
+            actions.append(np.float32(policy(t, worker.rows, obs, goal)))  # line 7
+            obs, success = worker.step(actions[-1])  # line 8
             steps.append(obs)
-    episodes = {
-        "obs": np.stack([obs["observation"] for obs in steps], axis=1),  # (N, T+1, O)
-        "achieved_goal": np.stack([obs["achieved_goal"] for obs in steps], axis=1),  # (N, T+1, G)
-        "desired_goal": goal,  # (N, G)
-        "action": np.stack(actions, axis=1),  # (N, T, A)
-    }
+        episodes = {
+            "obs": np.stack([obs["observation"] for obs in steps], axis=1),  # (n, T+1, O)
+            "achieved_goal": np.stack([obs["achieved_goal"] for obs in steps], axis=1),
+            "desired_goal": goal,  # (n, G)
+            "action": np.stack(actions, axis=1),  # (n, T, A)
+        }
+        return episodes, success
+
+    with one_torch_thread():
+        parts, successes = zip(*envs.each(play), strict=True)
+    episodes = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     for name, array in episodes.items():
         if not np.isfinite(array).all():
             raise FloatingPointError(f"NaN or Inf in the {name} of an episode")
-    return episodes, success
+    return episodes, np.concatenate(successes)
 
 
 def by_head(rows: np.ndarray, heads: int) -> np.ndarray:
@@ -63,18 +71,30 @@ def by_head(rows: np.ndarray, heads: int) -> np.ndarray:
     return rows.reshape(heads, -1, rows.shape[-1])
 
 
-def act(agent: EnsembleDDPG, obs: np.ndarray, goal: np.ndarray, heads: int) -> np.ndarray:
-    """Actions without noise of the first `heads` heads, which share the N environments evenly."""
-    action = agent.act(by_head(obs, heads), by_head(goal, heads), slice(heads))
-    return action.reshape(len(obs), -1)
+def actor(agent: EnsembleDDPG, heads: int, num_envs: int):
+    """A policy for `rollout`: the first `heads` heads without noise, which share the environments
+    evenly."""
+
+    def act(t, rows, obs, goal):
+        k = slice(rows.start * heads // num_envs, math.ceil(rows.stop * heads / num_envs))
+        action = agent.act(by_head(obs, k.stop - k.start), by_head(goal, k.stop - k.start), k)
+        return action.reshape(len(obs), -1)
+
+    return act
 
 
-def explore(action: np.ndarray, rng: np.random.Generator, noise: float, random_actions: float):
-    """HER's exploration (not in the paper): Gaussian noise, then some actions uniform instead.
-    action (N, A), and what it gives, in [-1, 1]."""
-    noisy = np.clip(action + noise * rng.standard_normal(action.shape), -1, 1)
-    uniform = rng.uniform(-1, 1, action.shape)
-    return np.where(rng.random((len(action), 1)) < random_actions, uniform, noisy)
+def explorer(policy, rng: np.random.Generator, shape, noise: float, random_actions: float):
+    """`policy` with HER's exploration (not in the paper): Gaussian noise, then some actions uniform
+    instead. shape: (T, N, A) of all that is drawn for an episode in each environment."""
+    gaussian = noise * rng.standard_normal(shape)
+    uniform = rng.uniform(-1, 1, shape)
+    instead = rng.random((*shape[:2], 1)) < random_actions
+
+    def explore(t, rows, obs, goal):
+        noisy = np.clip(policy(t, rows, obs, goal) + gaussian[t, rows], -1, 1)
+        return np.where(instead[t, rows], uniform[t, rows], noisy)
+
+    return explore
 
 
 def evaluate(envs, agent: EnsembleDDPG, heads: int, horizon: int, rounds: int, bar) -> dict:
@@ -82,7 +102,7 @@ def evaluate(envs, agent: EnsembleDDPG, heads: int, horizon: int, rounds: int, b
     rate, and the mean of Q_k(s, μ_k(s, g), g) over all steps."""
     successes, q = [], []
     for _ in range(rounds):
-        episodes, success = rollout(envs, lambda obs, goal: act(agent, obs, goal, heads), horizon)
+        episodes, success = rollout(envs, actor(agent, heads, envs.num_envs), horizon)
         obs = episodes["obs"][:, :-1]  # (N, T, O)
         goal = np.repeat(episodes["desired_goal"][:, None], horizon, axis=1)  # (N, T, G)
         q.append(agent.value(by_head(obs, heads), by_head(goal, heads)))
@@ -184,13 +204,10 @@ def train(config: Config, resume: bool = False) -> list[dict]:
 
     def collect(random_actions):  # lines 3-11
         acting = heads if config.acting_head == "all" else 1
-        episodes, success = rollout(
-            envs,
-            lambda obs, goal: explore(
-                act(agent, obs, goal, acting), play_rng, config.noise, random_actions
-            ),
-            horizon,
-        )
+        policy = actor(agent, acting, num_envs)
+        shape = (horizon, num_envs, env.action_space.shape[0])
+        policy = explorer(policy, play_rng, shape, config.noise, random_actions)
+        episodes, success = rollout(envs, policy, horizon)
         slots = original_buffer.add(episodes, play_rng)  # line 9
         if not vcp:
             her_buffer.new_episodes(slots)
@@ -214,7 +231,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
         rows = saved["rows"]
         env_steps, start = rows[-1]["env_steps"], start - rows[-1]["wall_seconds"]
 
-    with ParallelEnvs(config.env, num_envs, config.num_workers) as envs:
+    with ParallelEnvs(config.env, num_envs, config.num_workers, heads) as envs:
         records.start(folder, asdict(config), rows, resume)
         print(describe(config.env))
         for epoch in range(len(rows) + 1, config.epochs + 1):  # line 2

@@ -317,9 +317,8 @@ def test_a_worker_that_dies_is_reported():
     with pytest.raises(ChildProcessError, match=r"worker process of Reacher-v2 .*-9"):
         with ParallelEnvs("Reacher-v2", 4, 2) as envs:
             envs.reset(0)
-            os.kill(envs._envs.processes[1].pid, signal.SIGKILL)
-            for _ in range(3):
-                envs.step(np.zeros((4, 2), np.float32))
+            os.kill(envs.workers[1]._env.processes[0].pid, signal.SIGKILL)
+            run.rollout(envs, lambda t, rows, obs, goal: np.zeros((2, 2)), 3)
 
 
 # ------------------------------------------------------------------------------ bad input

@@ -6,6 +6,8 @@ environments on two cores that is a third of the time. So a worker holds a group
 
 import os
 import signal
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from types import SimpleNamespace
@@ -14,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import batch_space
 
 from envs_point import make_env
 
@@ -60,13 +63,16 @@ class EnvGroup(gym.Env):
 
     "is_success" of the step's info is the environment's own or, without one, Eq. (1)'s reward of 0.
     Nothing is reset by itself: episodes have a fixed length, and an environment that ends one early
-    raises RuntimeError. main: the main process's id; in any other process Ctrl-C is ignored and, if
+    raises RuntimeError.
+
+    main: the main process's id, for a group that lives in another; there Ctrl-C is ignored and, if
     `core` is given, that is the one processor that the process may use.
     """
 
-    def __init__(self, name: str, size: int, main: int, core: int | None = None):
+    def __init__(self, name: str, size: int, main: int | None = None, core: int | None = None):
         # AsyncVectorEnv makes one of these in the main process too, to look at its spaces.
-        if os.getpid() != main:
+        for_its_spaces = os.getpid() == main
+        if main and not for_its_spaces:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             if core is not None:
                 os.sched_setaffinity(0, {core})
@@ -74,9 +80,10 @@ class EnvGroup(gym.Env):
         def make():
             return read_joints_by_index(make_env(name))
 
-        self.envs = SyncVectorEnv([make] * size, autoreset_mode=AutoresetMode.DISABLED)
-        self.observation_space = self.envs.observation_space
-        self.action_space = self.envs.action_space
+        made = 1 if for_its_spaces else size
+        self.envs = SyncVectorEnv([make] * made, copy=False, autoreset_mode=AutoresetMode.DISABLED)
+        self.observation_space = batch_space(self.envs.single_observation_space, size)
+        self.action_space = batch_space(self.envs.single_action_space, size)
 
     def reset(self, *, seed=None, options=None):
         return self.envs.reset(seed=seed)[0], {}
@@ -92,61 +99,93 @@ class EnvGroup(gym.Env):
         self.envs.close()
 
 
-class ParallelEnvs:
-    """num_envs environments in worker processes, stepped together; use it in a `with`.
+class Worker:
+    """The environments `rows` of all, in a process of their own, or in this one without `main`."""
 
-    num_workers: None for one a core. It is lowered to a divisor of num_envs; with 1 there is no
-    other process.
+    def __init__(self, name: str, rows: slice, main: int | None = None, core: int | None = None):
+        self.name, self.rows, self.main = name, rows, main
+        group = partial(EnvGroup, name, rows.stop - rows.start, main, core)
+        vector = AsyncVectorEnv if main else SyncVectorEnv
+        self._env = vector([group], copy=False, autoreset_mode=AutoresetMode.DISABLED)
+
+    def reset(self, seed: int | None = None) -> dict[str, np.ndarray]:
+        """Start an episode in each. With a seed, environment i of all is seeded with seed + i;
+        without, it goes on with the random numbers it has. Gives float32 arrays of (n, ...)."""
+        seed = None if seed is None else [seed + self.rows.start]
+        return self._rows(self._ask(self._env.reset, seed=seed)[0])
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """One step in each: actions (n, A) in [-1, 1] -> observations, is_success (n,)."""
+        obs, _, _, _, info = self._ask(self._env.step, action[None])
+        return self._rows(obs), info["is_success"][0]
+
+    def close(self, now: bool) -> None:
+        """now: without waiting for a step that may be under way."""
+        try:
+            self._env.close(**({"terminate": now} if self.main else {}))
+        except (EOFError, ConnectionError):  # the process is dead, so there is nothing to close
+            self._env.closed = True
+
+    def _rows(self, obs):
+        return {name: x[0].astype(np.float32) for name, x in obs.items()}
+
+    def _ask(self, method, *args, **kwargs):
+        """Call it, and if the process is found dead say which environment's and how it ended."""
+        try:
+            return method(*args, **kwargs)
+        except (EOFError, ConnectionError) as error:
+            (process,) = self._env.processes
+            process.join(timeout=1)
+            raise ChildProcessError(
+                f"a worker process of {self.name} died (exit code {process.exitcode})"
+            ) from error
+
+
+class ParallelEnvs:
+    """num_envs environments in worker processes; use it in a `with`.
+
+    num_workers: None for one a core. It is lowered until each holds the same number of environments
+    and, where they are shared out among `heads`, those of whole heads or of a part of one. With 1
+    there is no other process.
     """
 
-    def __init__(self, name: str, num_envs: int, num_workers: int | None = None):
+    def __init__(self, name: str, num_envs: int, num_workers: int | None = None, heads: int = 1):
         cores = available_cores()
         most = min(num_workers or len(cores), num_envs)
-        self.name, self.num_envs = name, num_envs
-        self.num_workers = max(w for w in range(1, most + 1) if num_envs % w == 0)
-        self._group_size = num_envs // self.num_workers
+        self.num_workers = max(
+            w
+            for w in range(1, most + 1)
+            if num_envs % w == 0 and (heads % w == 0 or w % heads == 0)
+        )
+        self.num_envs, size = num_envs, num_envs // self.num_workers
         # Left alone, the scheduler wakes workers on the same core while another idles: with a core
         # each, a step of 16 FetchReach takes a fifth less. Fewer workers than cores may share the
         # machine with other runs, and stay free.
         pin = 1 < self.num_workers == len(cores) and hasattr(os, "sched_setaffinity")
-        groups = [
-            partial(EnvGroup, name, self._group_size, os.getpid(), cores[i] if pin else None)
+        self.workers = [
+            Worker(
+                name,
+                slice(i * size, (i + 1) * size),
+                main=os.getpid() if self.num_workers > 1 else None,
+                core=cores[i] if pin else None,
+            )
             for i in range(self.num_workers)
         ]
-        vector = AsyncVectorEnv if self.num_workers > 1 else SyncVectorEnv
-        self._envs = vector(groups, autoreset_mode=AutoresetMode.DISABLED)
 
-    def reset(self, seed: int | None = None) -> dict[str, np.ndarray]:
-        """Start an episode in each. With a seed, environment i is seeded with seed + i; without,
-        it goes on with the random numbers it has. Gives arrays of (num_envs, ...)."""
-        firsts = range(0, self.num_envs, self._group_size)
-        seeds = None if seed is None else [seed + first for first in firsts]
-        return self._flat(self._ask(self._envs.reset, seed=seeds)[0])
+    def each(self, function: Callable[[Worker], object]) -> list:
+        """function(worker) for all workers at the same time, each in a thread of its own, so that
+        none waits for another: while one acts, the other steps. Gives the results in order."""
+        with ThreadPoolExecutor(self.num_workers) as pool:
+            return list(pool.map(function, self.workers))
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """One step in each: actions (num_envs, A) in [-1, 1] -> observations, is_success (N,)."""
-        action = action.reshape(self.num_workers, self._group_size, -1)
-        obs, _, _, _, info = self._ask(self._envs.step, action)
-        return self._flat(obs), info["is_success"].reshape(-1)
-
-    def _flat(self, obs):
-        return {name: x.reshape(self.num_envs, -1) for name, x in obs.items()}
-
-    def _ask(self, method, *args, **kwargs):
-        """Call it, and if a worker is found dead say which environment's and how it ended."""
-        try:
-            return method(*args, **kwargs)
-        except (EOFError, ConnectionError) as error:
-            for process in self._envs.processes:
-                process.join(timeout=1)
-            codes = {p.exitcode for p in self._envs.processes} - {None}
-            raise ChildProcessError(
-                f"a worker process of {self.name} died (exit code {', '.join(map(str, codes))})"
-            ) from error
+    def reset(self, seed: int) -> None:
+        """Seed environment i with seed + i."""
+        self.each(lambda worker: worker.reset(seed))
 
     def __enter__(self):
         return self
 
     def __exit__(self, kind, *_):
         # After an error a worker may be in the middle of a step, or gone.
-        self._envs.close(**({"terminate": True} if kind and self.num_workers > 1 else {}))
+        for worker in self.workers:
+            worker.close(now=kind is not None)

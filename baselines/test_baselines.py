@@ -479,7 +479,7 @@ def test_every_method_in_each_of_the_sixteen(name):
     buffer = EpisodeBuffer(1000, 50, obs_dim, goal_dim, action_dim)
     with run.ParallelEnvs(name, 2, 1) as envs:
         envs.reset(0)
-        episodes, _ = run.rollout(envs, lambda o, g: rng.uniform(-1, 1, (2, action_dim)), 50)
+        episodes, _ = run.rollout(envs, lambda *_: rng.uniform(-1, 1, (2, action_dim)), 50)
 
     def reward_fn(achieved, desired):
         return env.unwrapped.compute_reward(achieved, desired, {})

@@ -123,17 +123,18 @@ def bench_collection(repeats: int, num_envs: int = 16, horizon: int = 50) -> Non
         env, rng = make_env(name), np.random.default_rng(0)  # as gymnasium makes it
         raw_actions = rng.uniform(-1, 1, (horizon, action_dim)).astype(np.float32)
 
-        def policy(obs, goal, agent=agent, rng=rng):
-            return run.explore(run.act(agent, obs, goal, 16), rng, 0.2, 0.3)
+        def play(agent=agent, rng=rng, shape=(horizon, num_envs, action_dim)):
+            policy = run.explorer(run.actor(agent, 16, num_envs), rng, shape, 0.2, 0.3)
+            run.rollout(envs, policy, horizon)
 
         def raw(env=env, actions=raw_actions):
             env.reset()
             for action in actions:
                 env.step(action)
 
-        with ParallelEnvs(name, num_envs) as envs:
+        with ParallelEnvs(name, num_envs, heads=16) as envs:
             envs.reset(0)
-            t = in_turn({"play": lambda: run.rollout(envs, policy, horizon), "raw": raw}, repeats)
+            t = in_turn({"play": play, "raw": raw}, repeats)
         rate, raw_rate = num_envs * horizon / t["play"], horizon / t["raw"]
         ratio = np.median(rate) / (cores * np.median(raw_rate))
         print(
