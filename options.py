@@ -4,7 +4,7 @@ import argparse
 import importlib.util
 import math
 import sys
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import Field, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import NoReturn, get_args
 
@@ -131,6 +131,11 @@ def flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
+def kind(f: Field) -> type:
+    """bool, int, float or str, for a field of Config that may also be None."""
+    return next(t for t in (bool, int, float, str) if t in (f.type, *get_args(f.type)))
+
+
 def fail(message: str) -> NoReturn:
     """One line on stderr and exit code 2."""
     print(f"run.py: {message}", file=sys.stderr)
@@ -153,11 +158,10 @@ def parse(argv: list[str] | None) -> tuple[dict, argparse.Namespace]:
         if f.type is bool:
             parser.add_argument(flag(f.name), action="store_true", default=keep_quiet, help=text)
         else:
-            kind = next(t for t in (int, float, str) if t in (f.type, *get_args(f.type)))
             text += "" if f.default is None else f" (default: {f.default})"
             choices = f.metadata["choices"]
             parser.add_argument(
-                flag(f.name), type=kind, choices=choices, default=keep_quiet, help=text
+                flag(f.name), type=kind(f), choices=choices, default=keep_quiet, help=text
             )
     given = vars(parser.parse_args(argv))
     command = argparse.Namespace(**{name: given.pop(name) for name in ("resume", "play", "gif")})

@@ -31,7 +31,6 @@ import options
 import records
 import run
 from envs_point import UsageError
-from experiments.curves import draw
 from options import Config
 from play import play
 from records import TIMING_COLUMNS, load_checkpoint, read_rows
@@ -423,13 +422,3 @@ def test_playing_a_run(whole, tmp_path, capsys):
             gif.seek(i)
             frames.append(np.asarray(gif.convert("RGB")).astype(int))
     assert np.abs(np.diff(frames, axis=0)).max() > 50  # something moves
-
-
-def test_the_curves_of_a_folder_of_results(tmp_path):
-    for env, seed, epochs in (("A-v1", 0, 3), ("A-v1", 1, 2), ("B-v1", 0, 1)):
-        folder = tmp_path / env / "vcp" / f"seed{seed}"
-        folder.mkdir(parents=True)
-        rows = [dict.fromkeys(records.COLUMNS, 0.5) for _ in range(epochs)]
-        records.start(folder, {"env": env, "method": "vcp", "seed": seed}, rows, resume=False)
-    with Image.open(draw(tmp_path)) as picture:
-        assert picture.width > picture.height

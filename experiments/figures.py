@@ -1,0 +1,241 @@
+"""The paper's figures from results/ alone: python -m experiments.figures NAME [--smooth WEIGHT]
+
+Reads config.json and progress.csv of every run below results/ and writes results/NAME.png. What a
+run is follows from its settings, whatever its folder is called.
+"""
+
+import argparse
+import re
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import options
+from options import Config
+from records import read_rows
+
+RESULTS = Path(__file__).parent.parent / "results"
+# Okabe and Ito's colours, which colour-blind people can tell apart, and dashes for print
+COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"]
+DASHES = ["-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)), (0, (3, 1, 1, 1))]
+BASELINES = ("her", "herebp", "cher", "dtgsh")
+
+
+@dataclass
+class Run:
+    config: Config
+    rows: dict[str, np.ndarray]  # the columns of progress.csv, (epochs,) each
+
+
+def read_runs(folder: Path) -> list[Run]:
+    """Every run below `folder`."""
+    runs = []
+    for file in sorted(folder.rglob("progress.csv")):
+        rows = read_rows(file.parent)
+        if rows:
+            columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+            runs.append(Run(options.load(file.parent), columns))
+    return runs
+
+
+def label(c: Config) -> str:
+    """What the legend calls the run: its method and what is not the paper's default."""
+    parts = [c.method.upper()]
+    if c.heads != (16 if c.method == "vcp" else 1):
+        parts.append(f"{c.heads} heads")
+    if c.priority != "consistency":
+        parts.append(f"{c.priority} priority")
+    if c.acting_head == "one":
+        parts.append("one acting head")
+    for name in ("temperature", "importance", "relabel_ratio", "her_thread", "faithful"):
+        if getattr(c, name) != getattr(Config, name):
+            parts.append(f"{name} {getattr(c, name)}")
+    return ", ".join(parts)
+
+
+ABLATIONS = ("VCP", "VCP, uniform priority", "VCP, variance priority", "VCP, one acting head")
+FIGURES = {  # name: (what it is, which runs by their label)
+    "fig2": (
+        "Figure 2: VCP (16 heads) and the other methods with one network",
+        lambda name: name in ("VCP", *map(str.upper, BASELINES)),
+    ),
+    "fig6": ("Figure 6: ablations of VCP", lambda name: name in ABLATIONS),
+    "fig7": (
+        "Figure 7: VCP with ensembles of other sizes",
+        lambda name: re.fullmatch(r"VCP(, \d+ heads)?", name),
+    ),
+    "fig9": (
+        "Figure 9: VCP and the other methods with the same ensemble",
+        lambda name: name in ("VCP", *(f"{m.upper()}, 16 heads" for m in BASELINES)),
+    ),
+}
+
+
+def smoothed(x: np.ndarray, weight: float) -> np.ndarray:
+    """Exponential moving average along the last axis; 0 leaves x as it is."""
+    y = x.astype(float)
+    for t in range(1, x.shape[-1]):
+        y[..., t] = weight * y[..., t - 1] + (1 - weight) * x[..., t]
+    return y
+
+
+def interval(x: np.ndarray, draws: int = 2000) -> tuple[np.ndarray, np.ndarray]:
+    """The 95 % interval of the mean over the first axis, seeds, by bootstrap. (S, ...) -> (...)."""
+    rng = np.random.default_rng(0)
+    means = x[rng.integers(len(x), size=(draws, len(x)))].mean(axis=1)
+    return tuple(np.quantile(means, [0.025, 0.975], axis=0))
+
+
+def draw_line(ax: Axes, seeds: list[np.ndarray], style: int, text: str, smooth: float) -> None:
+    """The mean over seeds by epoch, as far as all of them have come, and its interval."""
+    shortest = min(map(len, seeds))
+    y = smoothed(np.stack([s[:shortest] for s in seeds]), smooth)
+    epochs = np.arange(1, shortest + 1)
+    ax.plot(epochs, y.mean(axis=0), color=COLOURS[style], linestyle=DASHES[style], label=text)
+    if len(seeds) > 1:
+        ax.fill_between(epochs, *interval(y), color=COLOURS[style], alpha=0.15, linewidth=0)
+
+
+def schedule(c: Config) -> str:
+    """What is other than in Appendix B, for a title: nothing or a line."""
+    paper = options.paper_schedule(c.env, c.method)
+    if (c.cycles, c.updates, c.batch_size) == tuple(paper.values())[:3]:
+        return ""
+    return f"\n{c.cycles} cycles of {c.updates} updates of batch {c.batch_size}"
+
+
+def curves(runs: list[Run], title: str, smooth: float) -> Figure:
+    """A panel for each environment: test success by epoch of every method in `runs`."""
+    runs = sorted(runs, key=lambda r: (r.config.method != "vcp", r.config.heads))
+    names = list(dict.fromkeys(label(run.config) for run in runs))
+    by_env = defaultdict(lambda: defaultdict(list))
+    for run in runs:
+        by_env[run.config.env + schedule(run.config)][label(run.config)].append(
+            run.rows["test_success_rate"]
+        )
+    columns = min(len(by_env), 4)
+    lines = -(-len(by_env) // columns)
+    fig = Figure(figsize=(3.6 * columns, 3.2 * lines + 0.6), layout="constrained")
+    panels = fig.subplots(lines, columns, squeeze=False).flat
+    for ax, (env, methods) in zip(panels, sorted(by_env.items()), strict=False):
+        for name, seeds in methods.items():
+            draw_line(ax, seeds, names.index(name), f"{name} ({len(seeds)})", smooth)
+        ax.set(title=env, xlabel="epoch", ylim=(-0.03, 1.03))
+        ax.xaxis.get_major_locator().set_params(integer=True)
+        ax.grid(alpha=0.3)
+        ax.legend(fontsize=7)
+    for ax in list(fig.axes)[len(by_env) :]:
+        ax.axis("off")
+    how = f"; smoothed, weight {smooth}" if smooth else ""
+    fig.supylabel("test success rate", fontsize=9)
+    fig.suptitle(
+        f"{title}\nmean and 95 % interval over seeds (how many: in brackets){how}", fontsize=9
+    )
+    return fig
+
+
+def figure_4(runs: list[Run], smooth: float) -> Figure:
+    """Figure 4: the critics' variance on hindsight and on original transitions, by epoch."""
+    fig = Figure(figsize=(4.6, 3.4), layout="constrained")
+    ax = fig.subplots()
+    for i, kind in enumerate(("hindsight", "original")):
+        draw_line(ax, [run.rows[f"variance_{kind}"] for run in runs], i, kind, smooth)
+    ax.set(xlabel="epoch", ylabel="variance of the 16 Q-values", yscale="log")
+    ax.set_title(f"Figure 4: {runs[0].config.env}, half originals, {len(runs)} seeds", fontsize=9)
+    ax.grid(alpha=0.3)
+    ax.legend()
+    return fig
+
+
+def interquartile_mean(x: np.ndarray) -> float:
+    """The mean of the middle half of all entries (Agarwal et al., 2021)."""
+    x = np.sort(x, axis=None)
+    cut = len(x) // 4
+    return float(x[cut : len(x) - cut].mean())
+
+
+def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
+    """Two tables. For each environment and method: the first epoch with a success of 0.95 (median
+    over seeds), and the mean success over all epochs and over the last ones that all seeds have,
+    with 95 % intervals. For each method with more than one environment: the interquartile mean over
+    all of the second, with a bootstrap that draws seeds within each environment."""
+    scores = defaultdict(lambda: defaultdict(list))
+    for run in runs:
+        key = run.config.env + schedule(run.config).replace("\n", ", ")
+        scores[label(run.config)][key].append(run.rows["test_success_rate"])
+    lines, totals = [], []
+    for name, by_env in scores.items():
+        means = []
+        for env, seeds in by_env.items():
+            shortest = min(map(len, seeds))
+            success = np.stack([s[:shortest] for s in seeds])
+            firsts = [np.flatnonzero(s >= 0.95)[:1] + 1 for s in success]
+            first = np.median([f[0] if len(f) else np.inf for f in firsts])
+            columns = [f"{len(seeds)}", f"{shortest}", f"{first:g}"]
+            means.append(success.mean(axis=1))
+            for x in (means[-1], success[:, -last:].mean(axis=1)):
+                columns.append("{:.3f} ({:.3f}-{:.3f})".format(x.mean(), *interval(x)))
+            lines.append(f"| {env} | {name} | {' | '.join(columns)} |")
+        if len(by_env) > 1:
+            rng = np.random.default_rng(0)
+            drawn = [
+                interquartile_mean(np.concatenate([rng.choice(x, len(x)) for x in means]))
+                for _ in range(draws)
+            ]
+            middle = interquartile_mean(np.concatenate(means))
+            low, high = np.quantile(drawn, [0.025, 0.975])
+            totals.append(f"| {name} | {len(by_env)} | {middle:.3f} ({low:.3f}-{high:.3f}) |")
+    head = [f"| environment | method | seeds | epochs | first at .95 | mean | last {last} |"]
+    tables = [*head, "|---|---|---|---|---|---|---|", *sorted(lines)]
+    if totals:
+        tables += [
+            "",
+            "| method | environments | interquartile mean of the mean |",
+            "|---|---|---|",
+        ]
+    return "\n".join([*tables, *totals]) + "\n"
+
+
+def draw(name: str, results: Path = RESULTS, smooth: float = 0.0) -> Path:
+    """Write results/NAME.png, or .md for the summary, and give its path."""
+    runs = read_runs(results)
+    if name == "summary":
+        title, belongs = "", lambda name: True
+    elif name == "fig4":
+        title, belongs = "", lambda name: name == "VCP, relabel_ratio 0.5"
+    else:
+        title, belongs = FIGURES[name]
+    chosen = [run for run in runs if belongs(label(run.config))]
+    if not chosen:
+        sys.exit(f"figures.py: no runs for {name} in {results}")
+    if name == "summary":
+        path = results / "summary.md"
+        path.write_text(summary(chosen))
+        return path
+    fig = figure_4(chosen, smooth) if name == "fig4" else curves(chosen, title, smooth)
+    path = results / f"{name}.png"
+    fig.savefig(path, dpi=100)
+    return path
+
+
+NAMES = [*sorted([*FIGURES, "fig4"]), "summary"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("name", choices=[*NAMES, "all"])
+    parser.add_argument(
+        "--smooth", type=float, default=0.0, help="of the curves; the paper's: 0.9, or 0.6"
+    )
+    given = parser.parse_args()
+    for name in NAMES if given.name == "all" else [given.name]:
+        print(draw(name, smooth=given.smooth))
+
+
+if __name__ == "__main__":
+    main()

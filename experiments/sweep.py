@@ -1,0 +1,150 @@
+"""Many runs: environments x variants x seeds, on this machine or a Ray cluster.
+
+    python -m experiments.sweep --env FetchReach-v1 Reacher-v2 --seeds 0-4 \\
+        --variants "" priority=uniform method=her,heads=1 --set epochs=20
+
+A variant is a list of settings (the fields of options.Config), "" the defaults; --set goes for all
+runs. A run is in OUT/<env>/<variant>/seed<s>. Finished ones are skipped and broken ones resumed, so
+the same command goes on where it was stopped.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict, fields
+from pathlib import Path
+
+from tqdm import tqdm
+
+import options
+import records
+import run
+from envs_point import UsageError, make_env
+from options import Config
+
+ROOT = Path(__file__).parent.parent
+TYPES = {f.name: options.kind(f) for f in fields(Config)}
+
+
+def settings(text: str) -> dict:
+    """ "method=her,heads=1" -> {"method": "her", "heads": 1}. UsageError for what is no setting."""
+    given = {}
+    for part in filter(None, text.split(",")):
+        name, _, value = part.partition("=")
+        if name not in TYPES:
+            raise UsageError(f"{name} is no setting; they are {', '.join(TYPES)}")
+        try:
+            given[name] = value == "True" if TYPES[name] is bool else TYPES[name](value)
+        except ValueError as error:
+            raise UsageError(f"{part}: not of type {TYPES[name].__name__}") from error
+    return given
+
+
+def seeds(text: str) -> list[int]:
+    """ "0-2,7" -> [0, 1, 2, 7]."""
+    ends = [[int(end) for end in part.split("-")] for part in text.split(",")]
+    return [seed for part in ends for seed in range(part[0], part[-1] + 1)]
+
+
+def all_runs(
+    envs: list[str], variants: list[str], seeds: list[int], common: dict, out: Path
+) -> list[Config]:
+    """The configs of a sweep, seeds last, so that the first of each is done before the second of
+    any. UsageError if one of them cannot be run."""
+    runs = []
+    for seed in seeds:
+        for env in envs:
+            for variant in variants:
+                given = {**common, **settings(variant)}
+                folder = Path(out, env, variant.replace("=", "-").replace(",", "_") or "vcp")
+                config = Config(**given, env=env, seed=seed, out=str(folder / f"seed{seed}"))
+                runs.append(options.complete(config))
+    for env in envs:
+        make_env(env).close()
+    return runs
+
+
+def train_one(config: Config) -> None:
+    """Start the run, or go on with it if it was broken off. UsageError if the folder holds a run
+    with other settings."""
+    folder = Path(config.out)
+    resume = (folder / "config.json").exists()
+    if resume:
+        config = options.changed(options.load(folder), asdict(config))
+    run.train(config, resume=resume)
+
+
+def in_ray(runs: list[Config], cores: float, gpus: float, address: str | None) -> dict:
+    """Train all of them as tasks of Ray, which tries again what is lost with its worker. The errors
+    of those that failed, by folder."""
+    import ray
+
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # it would report to its makers
+    ray.init(
+        address=address,
+        log_to_driver=False,
+        include_dashboard=False,
+        runtime_env={"env_vars": {"PYTHONPATH": str(ROOT)}},
+    )
+    task = ray.remote(num_cpus=cores, num_gpus=gpus, max_retries=3)(train_one)
+    waiting = {task.remote(config): config for config in runs}
+    failed = {}
+    with tqdm(total=sum(config.epochs for config in runs), unit="epoch") as bar:
+        while waiting:
+            ready, _ = ray.wait(list(waiting), timeout=1)
+            for done in ready:
+                folder = waiting.pop(done).out
+                try:
+                    ray.get(done)
+                except ray.exceptions.RayError as error:
+                    failed[folder] = str(error).strip().splitlines()[-1]
+            bar.n = sum(epochs_done(config) for config in runs)
+            bar.set_postfix(left=len(waiting), failed=len(failed))
+    ray.shutdown()
+    return failed
+
+
+def epochs_done(config: Config) -> int:
+    return records.epochs_done(Path(config.out))
+
+
+def main(argv: Iterable[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="sweep.py", description=__doc__.split("\n")[0])
+    parser.add_argument("--env", nargs="+", required=True)
+    parser.add_argument("--variants", nargs="+", default=[""], metavar="NAME=VALUE,...")
+    parser.add_argument("--set", default="", metavar="NAME=VALUE,...", help="for all runs")
+    parser.add_argument("--seeds", default="0", help="such as 0-4 or 0,3 (default: 0)")
+    parser.add_argument("--out", default="runs", help="default: runs")
+    parser.add_argument("--cores", type=int, default=1, help="of each run (default: 1)")
+    parser.add_argument("--gpus", type=float, default=0, help="share of each run (default: 0)")
+    parser.add_argument("--address", help="of a Ray cluster (default: Ray on this machine)")
+    parser.add_argument("--list", action="store_true", help="print the runs and stop")
+    parser.add_argument("--task", type=int, help="train this one of --list here, without Ray")
+    given = parser.parse_args(argv)
+    try:
+        common = {**settings(given.set), "num_workers": given.cores}
+        out = Path(given.out).absolute()
+        runs = all_runs(given.env, given.variants, seeds(given.seeds), common, out)
+        if given.task is not None:
+            return train_one(runs[given.task])
+    except UsageError as error:
+        sys.exit(f"sweep.py: {error}")
+    if given.list:
+        for i, config in enumerate(runs):
+            print(f"{i:4} {epochs_done(config):4} of {config.epochs} epochs  {config.out}")
+        return None
+    failed = in_ray(
+        [config for config in runs if epochs_done(config) < config.epochs],
+        given.cores,
+        given.gpus,
+        given.address,
+    )
+    print(f"{len(runs) - len(failed)} of {len(runs)} runs are whole")
+    for folder, error in failed.items():
+        print(f"FAILED {folder}: {error}")
+    sys.exit(1 if failed else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,176 @@
+"""Tests of the figures, on made-up runs, and of the sweep."""
+
+import csv
+import json
+import sys
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+import options
+from envs_point import UsageError
+from experiments import figures, sweep
+from options import Config
+from records import COLUMNS, epochs_done
+from test_vcp import without_timing
+
+SMALL = "epochs=2,cycles=1,updates=1,batch_size=16,eval_episodes=16"
+
+
+def make_run(folder, epochs=6, level=1.0, **settings):
+    """A run's files, in which the success rises by `level` to 1 at most."""
+    config = options.complete(Config(**settings))
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps({"config": asdict(config)}))
+    with open(folder / "progress.csv", "w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(COLUMNS)
+        for epoch in range(1, epochs + 1):
+            row = dict.fromkeys(COLUMNS, 0.5) | {"epoch": epoch}
+            row["test_success_rate"] = min(1, level * epoch / 5 + 0.01 * config.seed)
+            table.writerow(row.values())
+
+
+@pytest.fixture
+def results(tmp_path):
+    variants = {
+        "vcp": {},
+        "uniform": {"priority": "uniform"},
+        "one": {"acting_head": "one"},
+        "four": {"heads": 4},
+        "half": {"relabel_ratio": 0.5},
+        "other": {"temperature": 1.0},
+        **{f"{m}{k}": {"method": m, "heads": k} for m in figures.BASELINES for k in (1, 16)},
+    }
+    for name, settings in variants.items():
+        for env in ("FetchReach-v1", "Reacher-v2"):
+            for seed in range(2):
+                folder = tmp_path / env / name / f"seed{seed}"
+                make_run(folder, epochs=6 + seed, env=env, seed=seed, **settings)
+    make_run(tmp_path / "small", env="FetchReach-v1", updates=2)
+    make_run(tmp_path / "just-begun", epochs=0, env="FetchReach-v1")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "lines"),
+    [
+        ("fig2", ["VCP (2)", *(f"{m.upper()} (2)" for m in figures.BASELINES)]),
+        ("fig9", ["VCP (2)", *(f"{m.upper()}, 16 heads (2)" for m in figures.BASELINES)]),
+        ("fig6", ["VCP (2)", "VCP, uniform priority (2)", "VCP, one acting head (2)"]),
+        ("fig7", ["VCP (2)", "VCP, 4 heads (2)"]),
+    ],
+)
+def test_each_figure_has_its_runs(name, lines, results, monkeypatch):
+    drawn = {}
+
+    def keep(runs, *args):
+        fig = curves(runs, *args)
+        for ax in fig.axes:
+            drawn[ax.get_title()] = [line.get_text() for line in ax.get_legend().get_texts()]
+        return fig
+
+    curves = figures.curves
+    monkeypatch.setattr(figures, "curves", keep)
+    path = figures.draw(name, results, smooth=0.5)
+    assert path.read_bytes()[:4] == b"\x89PNG"
+    assert sorted(drawn.pop("FetchReach-v1")) == sorted(drawn.pop("Reacher-v2")) == sorted(lines)
+    # another schedule is another panel, which says so
+    assert drawn == {"FetchReach-v1\n5 cycles of 2 updates of batch 64": ["VCP (1)"]}
+    assert figures.label(Config(temperature=1.0, method="vcp")) == "VCP, temperature 1.0"
+
+
+def test_figure_4(results):
+    assert figures.draw("fig4", results).read_bytes()[:4] == b"\x89PNG"
+
+
+def test_no_runs_is_said(tmp_path):
+    with pytest.raises(SystemExit, match="no runs for fig2"):
+        figures.draw("fig2", tmp_path)
+
+
+def test_the_summary(results):
+    rows = [line.split(" | ") for line in figures.draw("summary", results).read_text().splitlines()]
+    (vcp,) = [r for r in rows if r[:2] == ["| Reacher-v2", "VCP"]]
+    # success .2 .4 .6 .8 1 1 and .21 .41 .61 .81 1 1, six epochs that both have
+    assert vcp[2:5] == ["2", "6", "5"]
+    assert vcp[5].startswith("0.670 (0.667-0.673)") and vcp[6].startswith("0.763 (0.760-0.766)")
+    (total,) = [r for r in rows if r[0] == "| VCP" and r[1] == "3"]
+    assert total[2].startswith("0.669")  # of .667 three times and .673 twice
+
+
+def test_smoothing_and_statistics_by_hand():
+    x = np.array([[0.0, 1, 1]])
+    np.testing.assert_array_equal(figures.smoothed(x, 0), x)
+    np.testing.assert_allclose(figures.smoothed(x, 0.9), [[0, 0.1, 0.19]])
+    assert figures.interquartile_mean(np.array([9.0, 1, 2, 3, 4, 5, 6, -7])) == 3.5
+    low, high = figures.interval(np.array([0.0] * 50 + [1.0] * 50))
+    assert abs(low - (0.5 - 1.96 * 0.05)) < 0.015 and abs(high - (0.5 + 1.96 * 0.05)) < 0.015
+    low, high = figures.interval(np.full((3, 2), 0.7))
+    np.testing.assert_allclose([low, high], 0.7)
+
+
+def test_what_a_sweep_consists_of(tmp_path):
+    given = {"epochs": 20, "num_workers": 1}
+    variants = ["", "method=her,heads=1", "relabel_ratio=0.5"]
+    runs = sweep.all_runs(["FetchReach-v1"], variants, sweep.seeds("0-1,7"), given, tmp_path)
+    assert [c.seed for c in runs] == 3 * [0] + 3 * [1] + 3 * [7]
+    folders = [c.out.removeprefix(str(tmp_path)) for c in runs[:3]]
+    assert folders == [
+        f"/FetchReach-v1/{name}/seed0"
+        for name in ("vcp", "method-her_heads-1", "relabel_ratio-0.5")
+    ]
+    assert (runs[1].method, runs[1].heads, runs[1].epochs) == ("her", 1, 20)
+    assert sweep.settings("her_thread=True,temperature=5") == {
+        "her_thread": True,
+        "temperature": 5.0,
+    }
+
+
+@pytest.mark.parametrize("wrong", ["colour=red", "heads=many", "method=sac", "heads=0"])
+def test_a_sweep_of_what_cannot_be_run_is_refused(wrong, capsys):
+    arguments = ["--env", "PointMassEmptyEnv-v1", "--variants", wrong, "--list"]
+    with pytest.raises(SystemExit, match=wrong.split("=")[0]):
+        sweep.main(arguments)
+    with pytest.raises(UsageError):
+        sweep.all_runs(["Nowhere-v0"], [""], [0], {}, sweep.Path("runs"))
+
+
+def arguments(folder, *others):
+    its = ["--env", "PointMassEmptyEnv-v1", "--variants", "", "priority=uniform", "--set", SMALL]
+    return [*its, "--out", str(folder), *others]
+
+
+def test_a_task_of_a_sweep_is_skipped_done_or_gone_on_with(tmp_path, capsys):
+    """What a SLURM array does, without Ray."""
+    for task in (0, 1):
+        sweep.main(arguments(tmp_path / "a", "--task", str(task)))
+    whole = tmp_path / "a" / "PointMassEmptyEnv-v1" / "priority-uniform" / "seed0"
+    assert epochs_done(whole) == 2
+    stopped = [SMALL.replace("epochs=2", "epochs=1") if x == SMALL else x for x in arguments("b")]
+    stopped[stopped.index("b")] = str(tmp_path / "b")
+    sweep.main([*stopped, "--task", "1"])
+    sweep.main(arguments(tmp_path / "b", "--task", "1"))
+    resumed = tmp_path / "b" / "PointMassEmptyEnv-v1" / "priority-uniform" / "seed0"
+    assert without_timing(resumed) == without_timing(whole)
+    before = (resumed / "progress.csv").read_bytes()
+    sweep.main(arguments(tmp_path / "b", "--task", "1"))
+    assert (resumed / "progress.csv").read_bytes() == before
+    capsys.readouterr()
+    sweep.main(arguments(tmp_path / "b", "--list"))
+    assert [line.split()[1] for line in capsys.readouterr().out.splitlines()] == ["0", "2"]
+
+
+@pytest.mark.slow
+def test_a_sweep_in_ray(tmp_path, capsys):
+    pytest.importorskip("ray", reason="requirements-experiments.txt is not installed")
+    broken = tmp_path / "PointMassEmptyEnv-v1" / "priority-uniform" / "seed1"
+    make_run(broken, epochs=1, env="PointMassEmptyEnv-v1", seed=1)  # with other settings
+    with pytest.raises(SystemExit) as stop:
+        sweep.main(arguments(tmp_path, "--seeds", "0-1"))
+    out = capsys.readouterr().out
+    assert stop.value.code == 1 and "3 of 4 runs are whole" in out
+    assert f"FAILED {broken}: " in out and "was made with" in out
+    assert epochs_done(tmp_path / "PointMassEmptyEnv-v1" / "vcp" / "seed1") == 2
+    assert "ray" in sys.modules
