@@ -183,10 +183,10 @@ def test_herebp_draws_episodes_by_their_energy():
     speeds = np.array([0, 0.2, 0.5, 1])
     achieved = np.concatenate([path([v] * 5) for v in speeds])
     buffer, rng = stored(achieved), np.random.default_rng(0)
-    replay = HEREBP(buffer, 0.8, exact_reward, env_name="FetchPush-v1", dt=DT)
+    replay = HEREBP(buffer, 0.8, exact_reward, env_name="FetchPush-v1", dt=DT, temperature=3)
     replay.new_episodes(np.arange(4))
     energy = np.minimum(speeds**2 / 2, 0.5) + EPSILON
-    expected = energy ** (1 / 1.01) / np.sum(energy ** (1 / 1.01))
+    expected = energy ** (1 / 3.01) / np.sum(energy ** (1 / 3.01))
     batch = replay.sample(100_000, rng)
     e, t = batch["obs"].T.astype(int) // 10
     assert_frequencies(np.bincount(e, minlength=4), expected)
@@ -463,6 +463,7 @@ def test_limits_of_the_originals():
         replay = DTGSH(stored(one), 0.8, None, env_name=name)
         assert (replay.sigma, replay.most) == (sigma, most)
         replay = HEREBP(stored(one), 0.8, None, env_name=name, dt=DT)
+        assert replay.exponent == 1 / 1.01
         assert replay.settings[1] == {"F": 0.5, "H": 2.5}.get(name[0], math.inf)
 
 

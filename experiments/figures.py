@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import options
+from experiments import variance_figures
 from options import Config
 from records import read_rows
 
@@ -64,6 +65,7 @@ FIGURES = {  # name: (what it is, which runs by their label)
         "Figure 2: VCP (16 heads) and the other methods with one network",
         lambda name: name in ("VCP", *map(str.upper, BASELINES)),
     ),
+    "fig4": ("Figure 4", lambda name: name == "VCP, relabel_ratio 0.5"),
     "fig6": ("Figure 6: ablations of VCP", lambda name: name in ABLATIONS),
     "fig7": (
         "Figure 7: VCP with ensembles of other sizes",
@@ -201,29 +203,49 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
     return "\n".join([*tables, *totals]) + "\n"
 
 
+def from_arrays(name: str, folder: Path) -> Figure:
+    """fig3, fig5 or fig8, from the .npz files of experiments.didactic. FileNotFoundError if they
+    are not there."""
+
+    def load(stem):
+        return dict(np.load(folder / f"{stem}.npz"))
+
+    if name == "fig3":
+        return variance_figures.figure_3(load("fig3"))
+    if name == "fig5":
+        names = variance_figures.PRIORITIES
+        return variance_figures.figure_5({p: load(f"fig5_{p}") for p in names})
+    sizes = [int(file.stem.removeprefix("fig8_")) for file in folder.glob("fig8_*.npz")]
+    if not sizes:
+        raise FileNotFoundError(folder / "fig8_*.npz")
+    return variance_figures.figure_8({k: load(f"fig8_{k}") for k in sizes})
+
+
 def draw(name: str, results: Path = RESULTS, smooth: float = 0.0) -> Path:
     """Write results/NAME.png, or .md for the summary, and give its path."""
-    runs = read_runs(results)
-    if name == "summary":
-        title, belongs = "", lambda name: True
-    elif name == "fig4":
-        title, belongs = "", lambda name: name == "VCP, relabel_ratio 0.5"
-    else:
-        title, belongs = FIGURES[name]
-    chosen = [run for run in runs if belongs(label(run.config))]
+    path = results / f"{name}.png"
+    if name in ARRAYS:
+        try:
+            from_arrays(name, results / "didactic").savefig(path, dpi=100)
+        except FileNotFoundError as error:
+            sys.exit(f"figures.py: {error.filename or error} is missing: experiments.didactic")
+        return path
+    belongs = FIGURES[name][1] if name in FIGURES else lambda name: True
+    chosen = [run for run in read_runs(results) if belongs(label(run.config))]
     if not chosen:
         sys.exit(f"figures.py: no runs for {name} in {results}")
     if name == "summary":
         path = results / "summary.md"
         path.write_text(summary(chosen))
         return path
+    title = FIGURES[name][0]
     fig = figure_4(chosen, smooth) if name == "fig4" else curves(chosen, title, smooth)
-    path = results / f"{name}.png"
     fig.savefig(path, dpi=100)
     return path
 
 
-NAMES = [*sorted([*FIGURES, "fig4"]), "summary"]
+ARRAYS = ("fig3", "fig5", "fig8")
+NAMES = [*sorted([*FIGURES, *ARRAYS]), "summary"]
 
 
 def main() -> None:

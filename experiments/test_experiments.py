@@ -1,6 +1,7 @@
 """Tests of the figures, on made-up runs, and of the sweep."""
 
 import csv
+import importlib.util
 import json
 import sys
 from dataclasses import asdict
@@ -10,7 +11,7 @@ import pytest
 
 import options
 from envs_point import UsageError
-from experiments import figures, sweep
+from experiments import didactic, figures, sweep, variance_figures
 from options import Config
 from records import COLUMNS, epochs_done
 from test_vcp import without_timing
@@ -85,7 +86,40 @@ def test_figure_4(results):
     assert figures.draw("fig4", results).read_bytes()[:4] == b"\x89PNG"
 
 
+def test_the_figures_of_variances(tmp_path, monkeypatch):
+    """From the runs that they are of, but tiny, to the pictures."""
+    tiny = {"epochs": 1, "cycles": 1, "updates": 1, "batch_size": 64, "eval_episodes": 16}
+    monkeypatch.setattr(didactic, "SCHEDULE", {**tiny, "env": "PointMassEmptyEnv-v1"})
+    monkeypatch.setattr(didactic, "EPOCH", 1)
+    monkeypatch.setattr(didactic, "SIZES", (2, 4))
+    monkeypatch.setattr(didactic, "SHOWN", 40)
+    for module in (didactic, variance_figures):
+        monkeypatch.setattr(module, "STAGES", (1, 2))
+    monkeypatch.setattr(didactic, "RESULTS", tmp_path)
+    monkeypatch.setattr(sys, "argv", ["didactic", "--out", str(tmp_path / "runs")])
+    didactic.main()
+    data = dict(np.load(tmp_path / "didactic" / "fig3.npz"))
+    assert data["xy"].shape == (5, 51, 2) and data["variance"].shape == (5, 51)
+    assert (data["variance"] > 0).all()
+    data = dict(np.load(tmp_path / "didactic" / "fig5_variance.npz"))
+    assert {data[f"{kind}_2"].shape for kind in ("original", "her", "drawn")} == {(40, 4)}
+    for name in ("fig3", "fig8"):
+        assert figures.draw(name, tmp_path).read_bytes()[:4] == b"\x89PNG"
+    if importlib.util.find_spec("sklearn"):
+        assert figures.draw("fig5", tmp_path).read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_correlation_with_the_distance():
+    xy = np.stack([np.linspace(0, 1, 9) ** 2, np.zeros(9)], axis=1)[None].repeat(2, axis=0)
+    distance = np.linalg.norm(xy - xy[:, [3]], axis=-1)
+    variance = np.stack([distance[0] ** 3, -distance[1]])
+    r = variance_figures.distance_correlation({"xy": xy, "t": [3, 3], "variance": variance})
+    np.testing.assert_allclose(r, [1, -1])
+
+
 def test_no_runs_is_said(tmp_path):
+    with pytest.raises(SystemExit, match=r"fig3\.npz is missing"):
+        figures.draw("fig3", tmp_path)
     with pytest.raises(SystemExit, match="no runs for fig2"):
         figures.draw("fig2", tmp_path)
 
