@@ -11,7 +11,7 @@ import pytest
 
 import options
 from envs_point import UsageError
-from experiments import didactic, figures, sweep, variance_figures
+from experiments import didactic, effective, figures, sweep, variance_figures
 from options import Config
 from records import COLUMNS, epochs_done
 from test_vcp import without_timing
@@ -115,6 +115,17 @@ def test_the_correlation_with_the_distance():
     variance = np.stack([distance[0] ** 3, -distance[1]])
     r = variance_figures.distance_correlation({"xy": xy, "t": [3, 3], "variance": variance})
     np.testing.assert_allclose(r, [1, -1])
+
+
+def test_the_effective_sample_size(tmp_path, capsys):
+    assert effective.effective_share(np.full(50, 3.0), 9) == pytest.approx(1)
+    # σ² = 0 and 1 with 𝒯 = 1: p = 1 and ε / (1 + ε), so one of two is always drawn
+    assert effective.effective_share(np.array([0.0, 1.0]), 1) == pytest.approx(0.5, abs=1e-5)
+    sweep.main(arguments(tmp_path, "--task", "0"))
+    effective.main([str(tmp_path / "PointMassEmptyEnv-v1" / "vcp" / "seed0")])
+    line = capsys.readouterr().out.splitlines()[-1].split(" | ")
+    shares = [float(x.rstrip("% |")) for x in line[2:]]
+    assert line[1] == "2" and len(shares) == 5 and shares == sorted(shares, reverse=True)
 
 
 def test_no_runs_is_said(tmp_path):

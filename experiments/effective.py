@@ -1,0 +1,45 @@
+"""How much Eq. (4) prefers: python -m experiments.effective DIR...
+
+For the last checkpoint of each run, the effective sample size of B_h, 1 / Σ p², as a share of its
+transitions, at the paper's temperatures. 100 % is uniform; the rest is what is hardly ever drawn.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import options
+import records
+from envs_point import UsageError
+from vcp import value_consistency_priority
+
+TEMPERATURES = (1, 5, 9, 11, 15)  # Appendix B
+
+
+def effective_share(variance: np.ndarray, temperature: float) -> float:
+    """1 / (N Σ p²) for the variances (N,) in B_h: between 1/N, one is always drawn, and 1."""
+    p = value_consistency_priority(variance, temperature)
+    return float(1 / (len(p) * np.square(p).sum()))
+
+
+def main(folders: list[str]) -> None:
+    if not folders:
+        sys.exit("usage: python -m experiments.effective DIR...")
+    print(f"| run | epoch | {' | '.join(f'𝒯 = {t}' for t in TEMPERATURES)} |")
+    print(f"|---|---|{'---|' * len(TEMPERATURES)}")
+    for folder in map(Path, folders):
+        config, saved = options.load(folder), records.load_checkpoint(folder)
+        if saved is None or config.method != "vcp":
+            raise UsageError(f"{folder} holds no run of VCP with a whole epoch")
+        variance = saved["parts"][2]["rows"]["variance"].numpy()
+        shares = [f"{effective_share(variance, t):.1%}" for t in TEMPERATURES]
+        epoch = len(saved["rows"])
+        print(f"| {config.env}, {config.priority} priority | {epoch} | {' | '.join(shares)} |")
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except UsageError as error:
+        sys.exit(f"effective.py: {error}")
