@@ -13,7 +13,8 @@ from tqdm import tqdm
 import options
 import records
 from envs_point import UsageError, make_env
-from run import actor, make_agent, rollout
+from rollout import actor, rollout
+from run import make_agent
 from workers import ParallelEnvs
 
 EPISODES = 10  # of each head
