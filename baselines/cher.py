@@ -80,8 +80,8 @@ def select(
         # The last of those that remain moves to the place of the one that leaves.
         remaining[row, place[best, row]] = remaining[:, r[s] - 1]
         if faithful:
-            led = value > np.maximum.accumulate(np.vstack([np.full(sets, -np.inf), value]))[:-1]
-            led[best, row] = False
+            before = np.maximum.accumulate(np.vstack([np.full(sets, -np.inf), value]))[:-1]
+            led = value > before
             gain[np.broadcast_to(row, led.shape)[led], trio[led]] = 0
     return chosen
 

@@ -298,11 +298,12 @@ def main() -> None:
     bench_update(3 if quick else 20)
     bench_collection(2 if quick else 10)
     bench_priorities(2 if quick else 15)
-    bench_draws(2 if quick else 10)
     if quick:
         bench_epochs(1, 1, [16])
+        bench_draws(2)
     else:
         bench_epochs(2, 2, list(PAPER_MINUTES))
+        bench_draws(10)
         bench_methods(2)
 
 
