@@ -94,6 +94,8 @@ def complete(config: Config) -> Config:
             raise UsageError(f"{flag(name)} goes with --method vcp, not with {config.method}")
     if config.faithful and config.method in ("vcp", "her"):
         raise UsageError(f"--faithful does not go with --method {config.method}")
+    if config.method == "cher" and config.batch_size < 2:
+        raise UsageError("--method cher selects from twice the batch: --batch-size 2 or more")
     if config.seed < 0:
         raise UsageError(f"--seed must be 0 or more, not {config.seed}")
     if not math.isfinite(config.temperature):

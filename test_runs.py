@@ -347,6 +347,7 @@ BAD = [
     ("--priority energy", "--priority"),
     ("--method her --priority variance", "--priority goes with --method vcp"),
     ("--method cher --temperature 5", "--temperature goes with --method vcp"),
+    ("--method cher --batch-size 1", "--batch-size 2 or more"),
     ("--method her --faithful", "--faithful does not go with --method her"),
     ("--importance yes", "--importance"),
     ("--acting-head none", "--acting-head"),

@@ -504,6 +504,12 @@ def settings(method, heads, **others):
     return {**small, "method": method, "heads": heads}
 
 
+@pytest.mark.parametrize("method", OTHERS)
+def test_the_smallest_mini_batches(method, tmp_path):
+    least = 2 if method == "cher" else 1
+    train(Config(**settings(method, 1, batch_size=least), out=str(tmp_path / "run")))
+
+
 @pytest.mark.parametrize("heads", [1, 16])
 @pytest.mark.parametrize("method", OTHERS)
 def test_a_run_of_every_method(method, heads, tmp_path):
