@@ -22,7 +22,7 @@ from workers import ParallelEnvs
 
 SCHEDULE = {"env": "PointMassEmptyEnv-v1", "updates": 5, "batch_size": 64}
 EPOCH = 10  # of Figures 3 and 8
-SHOWN = 1000  # points of each kind in Figure 5
+SHOWN = 1000  # points of each kind that are kept for Figure 5
 SIZES = (2, 4, 8, 16, 32)  # K of Figure 8
 TRAJECTORIES = 5
 

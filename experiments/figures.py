@@ -111,8 +111,9 @@ def schedule(c: Config) -> str:
     return f"\n{c.cycles} cycles of {c.updates} updates of batch {c.batch_size}"
 
 
-def curves(runs: list[Run], title: str, smooth: float) -> Figure:
-    """A panel for each environment: test success by epoch of every method in `runs`."""
+def curves(runs: list[Run], title: str, smooth: float, alone: bool) -> Figure:
+    """A panel for each environment: test success by epoch of every method in `runs`. alone: also
+    where there is a single one, and nothing to compare it with."""
     runs = sorted(runs, key=lambda r: (r.config.method != "vcp", r.config.heads))
     names = list(dict.fromkeys(label(run.config) for run in runs))
     by_env = defaultdict(lambda: defaultdict(list))
@@ -120,6 +121,8 @@ def curves(runs: list[Run], title: str, smooth: float) -> Figure:
         by_env[run.config.env + schedule(run.config)][label(run.config)].append(
             run.rows["test_success_rate"]
         )
+    compared = {env: methods for env, methods in by_env.items() if len(methods) > 1}
+    by_env = by_env if alone else compared or by_env
     columns = min(len(by_env), 4)
     lines = -(-len(by_env) // columns)
     fig = Figure(figsize=(3.6 * columns, 3.2 * lines + 0.6), layout="constrained")
@@ -148,7 +151,9 @@ def figure_4(runs: list[Run], smooth: float) -> Figure:
     for i, kind in enumerate(("hindsight", "original")):
         draw_line(ax, [run.rows[f"variance_{kind}"] for run in runs], i, kind, smooth)
     ax.set(xlabel="epoch", ylabel="variance of the 16 Q-values", yscale="log")
-    ax.set_title(f"Figure 4: {runs[0].config.env}, half originals, {len(runs)} seeds", fontsize=9)
+    c = runs[0].config
+    title = f"Figure 4: {c.env}, half originals, seeds: {len(runs)}{schedule(c)}"
+    ax.set_title(title, fontsize=9)
     ax.grid(alpha=0.3)
     ax.legend()
     return fig
@@ -239,7 +244,10 @@ def draw(name: str, results: Path = RESULTS, smooth: float = 0.0) -> Path:
         path.write_text(summary(chosen))
         return path
     title = FIGURES[name][0]
-    fig = figure_4(chosen, smooth) if name == "fig4" else curves(chosen, title, smooth)
+    if name == "fig4":
+        fig = figure_4(chosen, smooth)
+    else:
+        fig = curves(chosen, title, smooth, alone=name == "fig2")
     fig.savefig(path, dpi=100)
     return path
 

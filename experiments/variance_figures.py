@@ -5,6 +5,7 @@ from matplotlib.figure import Figure
 
 BLUE, GREEN, RED = "#0072B2", "#009E73", "#D55E00"
 STAGES = (1, 4, 10)  # epochs of Figure 5
+MAPPED = 500  # points of each kind; t-SNE takes its time
 PRIORITIES = {"consistency": "lower variance first", "variance": "higher variance first"}
 
 
@@ -36,12 +37,12 @@ def figure_3(data: dict[str, np.ndarray]) -> Figure:
         ax.plot(*xy[0], "o", color=RED, markersize=7, label="start")
         ax.plot(*xy[-1], "s", color=GREEN, markersize=7, label="end")
         ax.plot(*xy[t], "k^", markersize=9, label="ŝ")
-        ax.set_title(f"rank correlation with\\nthe distance: {r:+.2f}", fontsize=8)
+        ax.set_title(f"rank correlation with\nthe distance: {r:+.2f}", fontsize=8)
         ax.set(aspect="equal", xlim=(-0.62, 0.62), ylim=(-0.62, 0.62), xticks=[], yticks=[])
         fig.colorbar(points, ax=ax, shrink=0.7, location="bottom").ax.tick_params(labelsize=6)
     panels[0].legend(fontsize=7)
     fig.suptitle(
-        "Figure 3: log₁₀ of the variance of ŝ with each achieved goal of its trajectory\\n"
+        "Figure 3: log₁₀ of the variance of ŝ with each achieved goal of its trajectory\n"
         "PointMassEmptyEnv-v1, 5 updates of batch 64 a cycle, epoch 10, one seed",
         fontsize=9,
     )
@@ -58,7 +59,7 @@ def figure_5(data: dict[str, dict[str, np.ndarray]]) -> Figure:
     panels = fig.subplots(len(STAGES), 4)
     for line, epoch in zip(panels, STAGES, strict=True):
         kinds = [f"{kind}_{epoch}" for kind in ("original", "her", "drawn")]
-        both = [data[priority][kind] for priority in PRIORITIES for kind in kinds]
+        both = [data[priority][kind][:MAPPED] for priority in PRIORITIES for kind in kinds]
         mapped = TSNE(random_state=0, init="pca").fit_transform(np.concatenate(both))
         parts = np.split(mapped, np.cumsum([len(x) for x in both])[:-1])
         for i, (priority, what) in enumerate(PRIORITIES.items()):
@@ -75,7 +76,7 @@ def figure_5(data: dict[str, dict[str, np.ndarray]]) -> Figure:
             shade = gaussian_kde(drawn.T)(np.stack([x.ravel(), y.ravel()])).reshape(x.shape)
             density.pcolormesh(x, y, shade, cmap="viridis")
             density.set_title(
-                f"density of what is drawn\\n(effective sample size {effective:.0%} of B_h)",
+                f"density of what is drawn\n(effective sample size {effective:.1%} of B_h)",
                 fontsize=8,
             )
             for ax in (points, density):
@@ -106,7 +107,7 @@ def figure_8(data: dict[int, dict[str, np.ndarray]]) -> Figure:
     panels[0].legend(fontsize=7)
     panels[-1].set_xlabel("variance of the K Q-values in B_h (dashed: medians)")
     fig.suptitle(
-        "Figure 8: PointMassEmptyEnv-v1, 5 updates of batch 64 a cycle,\\nepoch 10, one seed",
+        "Figure 8: PointMassEmptyEnv-v1, 5 updates of batch 64 a cycle,\nepoch 10, one seed",
         fontsize=9,
     )
     return fig
