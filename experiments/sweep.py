@@ -65,9 +65,10 @@ def all_runs(
     return runs
 
 
-def train_one(config: Config) -> None:
+def train_one(config: Config, here: str = ".") -> None:
     """Start the run, or go on with it if it was broken off. UsageError if the folder holds a run
-    with other settings."""
+    with other settings. here: what a relative folder is relative to."""
+    os.chdir(here)
     folder = Path(config.out)
     resume = (folder / "config.json").exists()
     if resume:
@@ -88,7 +89,7 @@ def in_ray(runs: list[Config], cores: float, gpus: float, address: str | None) -
         runtime_env={"env_vars": {"PYTHONPATH": str(ROOT)}},
     )
     task = ray.remote(num_cpus=cores, num_gpus=gpus, max_retries=3)(train_one)
-    waiting = {task.remote(config): config for config in runs}
+    waiting = {task.remote(config, os.getcwd()): config for config in runs}
     failed = {}
     with tqdm(total=sum(config.epochs for config in runs), unit="epoch") as bar:
         while waiting:
@@ -124,8 +125,7 @@ def main(argv: Iterable[str] | None = None) -> None:
     given = parser.parse_args(argv)
     try:
         common = {**settings(given.set), "num_workers": given.cores}
-        out = Path(given.out).absolute()
-        runs = all_runs(given.env, given.variants, seeds(given.seeds), common, out)
+        runs = all_runs(given.env, given.variants, seeds(given.seeds), common, Path(given.out))
         if given.task is not None:
             return train_one(runs[given.task])
     except UsageError as error:
