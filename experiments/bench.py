@@ -217,10 +217,10 @@ def cycle_seconds(cycles: int, **settings) -> dict[str, float]:
     }
 
 
-def bench_epochs(cycles: int, repeats: int, head_counts: list[int]) -> None:
+def bench_epochs(cycles: int, repeats: int, names: list[str]) -> None:
     print("\n4. An epoch at the paper's settings, beside the same epoch with --priority uniform")
     print("   (which scores B_h too: without any scoring it would lack section 3's share)")
-    for name in ("FetchPush-v1", "HandReach-v0"):
+    for name in names:
         t = {"consistency": [], "uniform": []}
         for _ in range(repeats):
             for priority, rows in t.items():
@@ -231,12 +231,15 @@ def bench_epochs(cycles: int, repeats: int, head_counts: list[int]) -> None:
             f"{name:14} VCP {spread(cycle['consistency'], digits=2)} s a cycle, uniform"
             f" {spread(cycle['uniform'], digits=2)} s, ratio {ratio:.2f}"
         )
+
+
+def bench_heads(cycles: int) -> None:
     print("\n5. Seconds a cycle and minutes an epoch by the number of heads, HandReach")
     print("   heads  s/cycle  min/epoch  paper's Table 2")
-    for heads in head_counts:
+    for heads, paper in PAPER_MINUTES.items():
         t = cycle_seconds(cycles, env="HandReach-v0", heads=heads)
         minutes = (50 * t["cycle"] + 10 * t["eval"]) / 60
-        print(f"   {heads:5} {t['cycle']:8.2f} {minutes:10.1f} {PAPER_MINUTES[heads]:16.1f}")
+        print(f"   {heads:5} {t['cycle']:8.2f} {minutes:10.1f} {paper:16.1f}")
 
 
 def bench_draws(repeats: int, heads: int = 16) -> None:
@@ -292,17 +295,18 @@ def bench_methods(cycles: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="fewer repeats: about a minute")
+    parser.add_argument("--quick", action="store_true", help="1 to 4 and 6, with fewer repeats")
     quick = parser.parse_args().quick
     print(f"PyTorch {torch.__version__}, {torch.get_num_threads()} threads")
-    bench_update(3 if quick else 20)
+    bench_update(2 if quick else 20)
     bench_collection(2 if quick else 10)
-    bench_priorities(2 if quick else 15)
+    bench_priorities(1 if quick else 15)
     if quick:
-        bench_epochs(1, 1, [16])
-        bench_draws(2)
+        bench_epochs(1, 1, ["FetchPush-v1"])
+        bench_draws(1)
     else:
-        bench_epochs(2, 2, list(PAPER_MINUTES))
+        bench_epochs(2, 2, ["FetchPush-v1", "HandReach-v0"])
+        bench_heads(2)
         bench_draws(10)
         bench_methods(2)
 
