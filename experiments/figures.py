@@ -114,7 +114,7 @@ def schedule(c: Config) -> str:
 def curves(runs: list[Run], title: str, smooth: float, alone: bool) -> Figure:
     """A panel for each environment: test success by epoch of every method in `runs`. alone: also
     where there is a single one, and nothing to compare it with."""
-    runs = sorted(runs, key=lambda r: (r.config.method != "vcp", r.config.heads))
+    runs = sorted(runs, key=lambda r: (r.config.method != "vcp", label(r.config) != "VCP"))
     names = list(dict.fromkeys(label(run.config) for run in runs))
     by_env = defaultdict(lambda: defaultdict(list))
     for run in runs:
@@ -123,9 +123,9 @@ def curves(runs: list[Run], title: str, smooth: float, alone: bool) -> Figure:
         )
     compared = {env: methods for env, methods in by_env.items() if len(methods) > 1}
     by_env = by_env if alone else compared or by_env
-    columns = min(len(by_env), 4)
+    columns = min(len(by_env), 5)
     lines = -(-len(by_env) // columns)
-    fig = Figure(figsize=(3.6 * columns, 3.2 * lines + 0.6), layout="constrained")
+    fig = Figure(figsize=(max(3.6 * columns, 5), 3.2 * lines + 0.6), layout="constrained")
     panels = fig.subplots(lines, columns, squeeze=False).flat
     for ax, (env, methods) in zip(panels, sorted(by_env.items()), strict=False):
         for name, seeds in methods.items():
