@@ -160,8 +160,9 @@ class HERReplay:
         if not self._left:
             self.data = self.draw(self.at_once, batch_size, rng)
             self._left, self.size = self.at_once, self.at_once * batch_size
+        first = (self.at_once - self._left) * batch_size
         self._left -= 1
-        rows = slice(self._left * batch_size, (self._left + 1) * batch_size)
+        rows = slice(first, first + batch_size)
         batch = {name: x[rows] for name, x in self.data.items()}
         return {**batch, "weight": np.ones(batch_size, np.float32)}
 

@@ -34,7 +34,7 @@ tqdm.monitor_interval = 0  # its watching thread would outlive a run
 
 def variance_by_kind(agent: EnsembleDDPG, her_buffer: HERBuffer, most: int = 4096) -> dict:
     """Figure 4: the mean variance of the critics NOW on the hindsight and the original transitions
-    of B_h, from at most about `most` of them, evenly spread."""
+    of B_h or, without VCP, of what was drawn last; from about `most` of them, evenly spread."""
     every = slice(None, her_buffer.size, max(1, her_buffer.size // most))
     rows = {name: x[every] for name, x in her_buffer.data.items()}
     variance = agent.q_variance(rows["obs"], rows["action"], rows["goal"])

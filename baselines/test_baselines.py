@@ -321,7 +321,7 @@ def test_cher_weighs_proximity_more_and_more_and_starts_again(monkeypatch):
     assert tau == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 0, 0, 1, 1]
     goal, achieved, _ = seen[0]
     assert goal.shape == achieved.shape == (4, 16, 2)
-    for u, batch in zip((3, 2, 1, 0), batches[:4], strict=True):  # drawn together, used backwards
+    for u, batch in enumerate(batches[:4]):  # drawn together, used in the order of their τ
         # the achieved goal is the one of the step itself, not of the next
         pairs = {(*g, *a) for g, a in zip(goal[u].tolist(), achieved[u].tolist(), strict=True)}
         ours = np.concatenate([batch["goal"], batch["obs"] / 10], axis=1).tolist()
@@ -441,9 +441,9 @@ def test_dtgsh_draws_episodes_by_their_diversity(monkeypatch):
     assert abs(drawn["hindsight"].mean() - (1 - 64 * 0.2 / 100)) < 0.01
     (kernel,) = kernels
     assert kernel.shape == (400, 100, 100)
-    last = batches[0]["goal"].astype(float)  # drawn together, used backwards
-    apart = np.square(last[:, None] - last[None]).sum(axis=-1)
-    np.testing.assert_allclose(kernel[-1, :64, :64], np.exp(-apart / (2 * 0.5**2)), rtol=1e-9)
+    first = batches[0]["goal"].astype(float)
+    apart = np.square(first[:, None] - first[None]).sum(axis=-1)
+    np.testing.assert_allclose(kernel[0, :64, :64], np.exp(-apart / (2 * 0.5**2)), rtol=1e-9)
 
 
 def test_dtgsh_where_nothing_moves():

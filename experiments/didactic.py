@@ -13,7 +13,8 @@ import numpy as np
 import options
 import records
 import run
-from envs_point import make_env
+from envs_point import UsageError, make_env
+from experiments.effective import effective_share
 from experiments.figures import RESULTS
 from experiments.variance_figures import STAGES
 from her import EpisodeBuffer
@@ -28,10 +29,14 @@ TRAJECTORIES = 5
 
 
 def trained(config: Config, epoch: int):
-    """The agent, B_o and B_h after `epoch` epochs of the run, which is trained as far as needed."""
+    """The agent, B_o and B_h after `epoch` epochs of the run, which is trained as far as needed.
+    UsageError for a run that is past that epoch: its checkpoint is a later one's."""
     config = options.complete(replace(config, epochs=epoch))
     folder = Path(config.out)
-    if records.epochs_done(folder) < epoch:
+    done = records.epochs_done(folder)
+    if done > epoch:
+        raise UsageError(f"{folder} has {done} epochs, not {epoch}: remove it or choose an --out")
+    if done < epoch:
         run.train(config, resume=(folder / "config.json").exists())
     env = make_env(config.env)
     agent = run.make_agent(config, env)
@@ -79,8 +84,7 @@ def figure_5(config: Config) -> dict[str, np.ndarray]:
         points[f"her_{epoch}"] = np.hstack([her_buffer.data[k][i] for k in ("obs", "goal")])
         drawn = her_buffer.sample(SHOWN, rng)
         points[f"drawn_{epoch}"] = np.hstack([drawn["obs"], drawn["goal"]])
-        p = her_buffer.probabilities
-        points[f"effective_{epoch}"] = np.array(1 / np.square(p).sum() / len(p))
+        points[f"effective_{epoch}"] = np.array(effective_share(her_buffer.probabilities))
     return {name: x.astype(np.float32) for name, x in points.items()}
 
 
@@ -109,16 +113,23 @@ def jobs(out: Path) -> dict:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("names", nargs="*", help="of the files to make (default: all)")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help="of the files to make (default: all)"
+    )
     parser.add_argument("--out", default="runs/didactic", help="the runs (default: runs/didactic)")
     given = parser.parse_args()
     made = jobs(Path(given.out))
+    if unknown := set(given.names) - made.keys():
+        parser.error(f"no {', '.join(sorted(unknown))}; there are {', '.join(made)}")
     folder = RESULTS / "didactic"
     folder.mkdir(parents=True, exist_ok=True)
-    for name in given.names or made:
-        function, config = made[name]
-        np.savez_compressed(folder / f"{name}.npz", **function(config))
-        print(folder / f"{name}.npz")
+    try:
+        for name in given.names or made:
+            function, config = made[name]
+            np.savez_compressed(folder / f"{name}.npz", **function(config))
+            print(folder / f"{name}.npz")
+    except UsageError as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

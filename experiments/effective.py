@@ -17,9 +17,8 @@ from vcp import value_consistency_priority
 TEMPERATURES = (1, 5, 9, 11, 15)  # Appendix B
 
 
-def effective_share(variance: np.ndarray, temperature: float) -> float:
-    """1 / (N Σ p²) for the variances (N,) in B_h: between 1/N, one is always drawn, and 1."""
-    p = value_consistency_priority(variance, temperature)
+def effective_share(p: np.ndarray) -> float:
+    """1 / (N Σ p²) for the probabilities (N,) in B_h: between 1/N, one is always drawn, and 1."""
     return float(1 / (len(p) * np.square(p).sum()))
 
 
@@ -33,7 +32,8 @@ def main(folders: list[str]) -> None:
         if saved is None or config.method != "vcp":
             raise UsageError(f"{folder} holds no run of VCP with a whole epoch")
         variance = saved["parts"][2]["rows"]["variance"].numpy()
-        shares = [f"{effective_share(variance, t):.1%}" for t in TEMPERATURES]
+        priorities = [value_consistency_priority(variance, t) for t in TEMPERATURES]
+        shares = [f"{effective_share(p):.1%}" for p in priorities]
         epoch = len(saved["rows"])
         print(f"| {config.env}, {config.priority} priority | {epoch} | {' | '.join(shares)} |")
 

@@ -25,6 +25,7 @@ from options import Config
 
 ROOT = Path(__file__).parent.parent
 TYPES = {f.name: options.kind(f) for f in fields(Config)}
+BOOLS = {"True": True, "False": False}
 
 
 def settings(text: str) -> dict:
@@ -35,8 +36,8 @@ def settings(text: str) -> dict:
         if name not in TYPES:
             raise UsageError(f"{name} is no setting; they are {', '.join(TYPES)}")
         try:
-            given[name] = value == "True" if TYPES[name] is bool else TYPES[name](value)
-        except ValueError as error:
+            given[name] = BOOLS[value] if TYPES[name] is bool else TYPES[name](value)
+        except (KeyError, ValueError) as error:
             raise UsageError(f"{part}: not of type {TYPES[name].__name__}") from error
     return given
 
@@ -57,7 +58,8 @@ def all_runs(
         for env in envs:
             for variant in variants:
                 given = {**common, **settings(variant)}
-                folder = Path(out, env, variant.replace("=", "-").replace(",", "_") or "vcp")
+                name = variant.replace("=", "-").replace(",", "_") or given.get("method", "vcp")
+                folder = Path(out, env, name)
                 config = Config(**given, env=env, seed=seed, out=str(folder / f"seed{seed}"))
                 runs.append(options.complete(config))
     for env in envs:
@@ -115,7 +117,7 @@ def main(argv: Iterable[str] | None = None) -> None:
     parser.add_argument("--env", nargs="+", required=True)
     parser.add_argument("--variants", nargs="+", default=[""], metavar="NAME=VALUE,...")
     parser.add_argument("--set", default="", metavar="NAME=VALUE,...", help="for all runs")
-    parser.add_argument("--seeds", default="0", help="such as 0-4 or 0,3 (default: 0)")
+    parser.add_argument("--seeds", type=seeds, default="0", help="such as 0-4 or 0,3 (default: 0)")
     parser.add_argument("--out", default="runs", help="default: runs")
     parser.add_argument("--cores", type=int, default=1, help="of each run (default: 1)")
     parser.add_argument("--gpus", type=float, default=0, help="share of each run (default: 0)")
@@ -125,21 +127,19 @@ def main(argv: Iterable[str] | None = None) -> None:
     given = parser.parse_args(argv)
     try:
         common = {**settings(given.set), "num_workers": given.cores}
-        runs = all_runs(given.env, given.variants, seeds(given.seeds), common, Path(given.out))
+        runs = all_runs(given.env, given.variants, given.seeds, common, Path(given.out))
         if given.task is not None:
+            if not 0 <= given.task < len(runs):
+                raise UsageError(f"--task {given.task}: there are {len(runs)} runs, see --list")
             return train_one(runs[given.task])
     except UsageError as error:
-        sys.exit(f"sweep.py: {error}")
+        parser.error(str(error))
     if given.list:
         for i, config in enumerate(runs):
             print(f"{i:4} {epochs_done(config):4} of {config.epochs} epochs  {config.out}")
         return None
-    failed = in_ray(
-        [config for config in runs if epochs_done(config) < config.epochs],
-        given.cores,
-        given.gpus,
-        given.address,
-    )
+    left = [config for config in runs if epochs_done(config) < config.epochs]
+    failed = in_ray(left, given.cores, given.gpus, given.address) if left else {}
     print(f"{len(runs) - len(failed)} of {len(runs)} runs are whole")
     for folder, error in failed.items():
         print(f"FAILED {folder}: {error}")

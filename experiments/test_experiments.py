@@ -15,6 +15,7 @@ from experiments import didactic, effective, figures, sweep, variance_figures
 from options import Config
 from records import COLUMNS, epochs_done
 from test_vcp import without_timing
+from vcp import value_consistency_priority
 
 SMALL = "epochs=2,cycles=1,updates=1,batch_size=16,eval_episodes=16"
 
@@ -87,7 +88,7 @@ def test_figure_4(results):
     assert figures.draw("fig4", results).read_bytes()[:4] == b"\x89PNG"
 
 
-def test_the_figures_of_variances(tmp_path, monkeypatch):
+def test_the_figures_of_variances(tmp_path, monkeypatch, capsys):
     """From the runs that they are of, but tiny, to the pictures."""
     tiny = {"epochs": 1, "cycles": 1, "updates": 1, "batch_size": 64, "eval_episodes": 16}
     monkeypatch.setattr(didactic, "SCHEDULE", {**tiny, "env": "PointMassEmptyEnv-v1"})
@@ -99,6 +100,9 @@ def test_the_figures_of_variances(tmp_path, monkeypatch):
     monkeypatch.setattr(didactic, "RESULTS", tmp_path)
     monkeypatch.setattr(sys, "argv", ["didactic", "--out", str(tmp_path / "runs")])
     didactic.main()
+    with pytest.raises(SystemExit):  # epoch 1 is gone: no figure of epoch 2 in its place
+        didactic.main()
+    assert "has 2 epochs, not 1" in capsys.readouterr().err
     data = dict(np.load(tmp_path / "didactic" / "fig3.npz"))
     assert data["xy"].shape == (5, 51, 2) and data["variance"].shape == (5, 51)
     assert (data["variance"] > 0).all()
@@ -119,9 +123,12 @@ def test_the_correlation_with_the_distance():
 
 
 def test_the_effective_sample_size(tmp_path, capsys):
-    assert effective.effective_share(np.full(50, 3.0), 9) == pytest.approx(1)
+    assert effective.effective_share(value_consistency_priority(np.full(50, 3.0), 9)) == (
+        pytest.approx(1)
+    )
     # σ² = 0 and 1 with 𝒯 = 1: p = 1 and ε / (1 + ε), so one of two is always drawn
-    assert effective.effective_share(np.array([0.0, 1.0]), 1) == pytest.approx(0.5, abs=1e-5)
+    one = value_consistency_priority(np.array([0.0, 1.0]), 1)
+    assert effective.effective_share(one) == pytest.approx(0.5, abs=1e-5)
     sweep.main(arguments(tmp_path, "--task", "0"))
     effective.main([str(tmp_path / "PointMassEmptyEnv-v1" / "vcp" / "seed0")])
     line = capsys.readouterr().out.splitlines()[-1].split(" | ")
@@ -174,11 +181,25 @@ def test_what_a_sweep_consists_of(tmp_path):
     }
 
 
-@pytest.mark.parametrize("wrong", ["colour=red", "heads=many", "method=sac", "heads=0"])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "--variants colour=red",
+        "--variants heads=many",
+        "--variants method=sac",
+        "--variants heads=0",
+        "--variants her_thread=true",
+        "--seeds many",
+        "--task 1",
+    ],
+)
 def test_a_sweep_of_what_cannot_be_run_is_refused(wrong, capsys):
-    arguments = ["--env", "PointMassEmptyEnv-v1", "--variants", wrong, "--list"]
-    with pytest.raises(SystemExit, match=wrong.split("=")[0]):
-        sweep.main(arguments)
+    with pytest.raises(SystemExit) as stop:
+        sweep.main(["--env", "PointMassEmptyEnv-v1", "--list", *wrong.split()])
+    option, value = wrong.split()
+    named = option if option != "--variants" else value.split("=")[0]
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert stop.value.code == 2 and named in error.split("error:")[1]
     with pytest.raises(UsageError):
         sweep.all_runs(["Nowhere-v0"], [""], [0], {}, sweep.Path("runs"))
 
