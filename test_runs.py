@@ -295,6 +295,16 @@ class BrokenReward(envs_point.PointMass):
         return self._observe(), {}
 
 
+class Hasty(envs_point.PointMass):
+    """Ends its episodes at step 7."""
+
+    def step(self, action):
+        self.steps = getattr(self, "steps", 0) + 1
+        obs, reward, _, _, info = super().step(action)
+        return obs, reward, self.steps == 7, False, info
+
+
+gym.register("Hasty-v0", Hasty, max_episode_steps=10)
 gym.register("Broken-v0", Broken, max_episode_steps=10)
 gym.register("BrokenReward-v0", BrokenReward, max_episode_steps=50)
 
@@ -310,6 +320,16 @@ def test_a_nan_stops_the_run_and_says_where(tmp_path):
     settings = {**SMALL, "out": str(tmp_path / "lr"), "epochs": 1, "learning_rate": 1e30}
     with pytest.raises(FloatingPointError, match="variance of the Q-values"):
         run.train(Config(**settings))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_environment_that_ends_its_episodes_early_is_refused(workers, tmp_path, capfd):
+    arguments = [a for a in ARGUMENTS if not a.startswith(("--env", "--num-workers"))]
+    with pytest.raises(SystemExit) as stop:
+        run.main([*arguments, "--env=Hasty-v0", f"--num-workers={workers}", f"--out={tmp_path}/r"])
+    assert stop.value.code == 2 and not multiprocessing.active_children()
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "epoch" not in line]
+    assert line == "run.py: Hasty-v0 ended an episode early: HER here needs a fixed length"
 
 
 def test_a_worker_that_dies_is_reported():

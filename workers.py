@@ -18,7 +18,7 @@ import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
 
-from envs_point import make_env
+from envs_point import UsageError, make_env
 
 
 def available_cores() -> list[int]:
@@ -62,8 +62,7 @@ class EnvGroup(gym.Env):
     """Several environments as one: its observations and actions have a first axis over them.
 
     "is_success" of the step's info is the environment's own or, without one, Eq. (1)'s reward of 0.
-    Nothing is reset by itself: episodes have a fixed length, and an environment that ends one early
-    raises RuntimeError.
+    Nothing is reset by itself: episodes have a fixed length. `terminated`: if any has ended early.
 
     main: the main process's id, for a group that lives in another; there Ctrl-C is ignored and, if
     `core` is given, that is the one processor that the process may use.
@@ -90,10 +89,8 @@ class EnvGroup(gym.Env):
 
     def step(self, action):
         obs, reward, terminated, _, info = self.envs.step(action)
-        if terminated.any():
-            raise RuntimeError("an episode terminated early; HER here needs a fixed length")
         success = np.asarray(info.get("is_success", reward == 0), dtype=bool)
-        return obs, 0.0, False, False, {"is_success": success}
+        return obs, 0.0, bool(terminated.any()), False, {"is_success": success}
 
     def close(self):
         self.envs.close()
@@ -115,8 +112,11 @@ class Worker:
         return self._rows(self._ask(self._env.reset, seed=seed)[0])
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """One step in each: actions (n, A) in [-1, 1] -> observations, is_success (n,)."""
-        obs, _, _, _, info = self._ask(self._env.step, action[None])
+        """One step in each: actions (n, A) in [-1, 1] -> observations, is_success (n,).
+        UsageError if an environment ends its episode."""
+        obs, _, terminated, _, info = self._ask(self._env.step, action[None])
+        if terminated.any():
+            raise UsageError(f"{self.name} ended an episode early: HER here needs a fixed length")
         return self._rows(obs), info["is_success"][0]
 
     def close(self, now: bool) -> None:
