@@ -168,43 +168,49 @@ def interquartile_mean(x: np.ndarray) -> float:
 
 def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
     """Two tables. For each environment and method: the first epoch with a success of 0.95 (median
-    over seeds), and the mean success over all epochs and over the last ones that all seeds have,
-    with 95 % intervals. For each method with more than one environment: the interquartile mean over
-    all of the second, with a bootstrap that draws seeds within each environment."""
-    scores = defaultdict(lambda: defaultdict(list))
+    over seeds), the mean success over the epochs that all runs of the environment have, and over
+    the last ones of each run, with 95 % intervals. For each method that shares more than one
+    environment with VCP: the interquartile mean over all of the second for both, on the shared
+    ones, with a bootstrap that draws seeds within each environment."""
+    curves = defaultdict(lambda: defaultdict(list))
     for run in runs:
         key = run.config.env + schedule(run.config).replace("\n", ", ")
-        scores[label(run.config)][key].append(run.rows["test_success_rate"])
-    lines, totals = [], []
-    for name, by_env in scores.items():
-        means = []
-        for env, seeds in by_env.items():
-            shortest = min(map(len, seeds))
-            success = np.stack([s[:shortest] for s in seeds])
-            firsts = [np.flatnonzero(s >= 0.95)[:1] + 1 for s in success]
+        curves[key][label(run.config)].append(run.rows["test_success_rate"])
+    lines, means = [], defaultdict(dict)
+    for env, methods in sorted(curves.items()):
+        epochs = min(len(curve) for seeds in methods.values() for curve in seeds)
+        for name, seeds in sorted(methods.items()):
+            firsts = [np.flatnonzero(curve >= 0.95)[:1] + 1 for curve in seeds]
             first = np.median([f[0] if len(f) else np.inf for f in firsts])
-            columns = [f"{len(seeds)}", f"{shortest}", f"{first:g}"]
-            means.append(success.mean(axis=1))
-            for x in (means[-1], success[:, -last:].mean(axis=1)):
-                columns.append("{:.3f} ({:.3f}-{:.3f})".format(x.mean(), *interval(x)))
+            means[name][env] = np.array([curve[:epochs].mean() for curve in seeds])
+            end = np.array([curve[-last:].mean() for curve in seeds])
+            columns = [f"{len(seeds)}", f"{epochs}", "never" if np.isinf(first) else f"{first:g}"]
+            for x in (means[name][env], end):
+                columns.append(f"{x.mean():.3f}")
+                if len(seeds) > 1:
+                    columns[-1] += " ({:.3f}-{:.3f})".format(*interval(x))
             lines.append(f"| {env} | {name} | {' | '.join(columns)} |")
-        if len(by_env) > 1:
-            rng = np.random.default_rng(0)
-            drawn = [
-                interquartile_mean(np.concatenate([rng.choice(x, len(x)) for x in means]))
-                for _ in range(draws)
-            ]
-            middle = interquartile_mean(np.concatenate(means))
-            low, high = np.quantile(drawn, [0.025, 0.975])
-            totals.append(f"| {name} | {len(by_env)} | {middle:.3f} ({low:.3f}-{high:.3f}) |")
-    head = [f"| environment | method | seeds | epochs | first at .95 | mean | last {last} |"]
-    tables = [*head, "|---|---|---|---|---|---|---|", *sorted(lines)]
-    if totals:
-        tables += [
-            "",
-            "| method | environments | interquartile mean of the mean |",
-            "|---|---|---|",
+
+    def total(scores: list[np.ndarray]) -> str:
+        rng = np.random.default_rng(0)
+        drawn = [
+            interquartile_mean(np.concatenate([rng.choice(x, len(x)) for x in scores]))
+            for _ in range(draws)
         ]
+        low, high = np.quantile(drawn, [0.025, 0.975])
+        return f"{interquartile_mean(np.concatenate(scores)):.3f} ({low:.3f}-{high:.3f})"
+
+    totals = []
+    for name, by_env in sorted(means.items()):
+        shared = [env for env in by_env if env in means["VCP"]]
+        if name != "VCP" and len(shared) > 1:
+            both = (total([means[n][env] for env in shared]) for n in (name, "VCP"))
+            totals.append(f"| {name} | {', '.join(shared)} | {' | '.join(both)} |")
+    head = [f"| environment | method | seeds | epochs | first at .95 | mean | last {last} |"]
+    tables = [*head, "|---|---|---|---|---|---|---|", *lines]
+    if totals:
+        tables += ["", "| method | environments | interquartile mean of the mean | VCP's |"]
+        tables += ["|---|---|---|---|"]
     return "\n".join([*tables, *totals]) + "\n"
 
 

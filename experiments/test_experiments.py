@@ -40,7 +40,7 @@ def results(tmp_path):
         "vcp": {},
         "uniform": {"priority": "uniform"},
         "one": {"acting_head": "one"},
-        "four": {"heads": 4},
+        "four": {"heads": 4, "level": 0.5},
         "half": {"relabel_ratio": 0.5},
         "other": {"temperature": 1.0},
         **{f"{m}{k}": {"method": m, "heads": k} for m in figures.BASELINES for k in (1, 16)},
@@ -146,11 +146,14 @@ def test_no_runs_is_said(tmp_path):
 def test_the_summary(results):
     rows = [line.split(" | ") for line in figures.draw("summary", results).read_text().splitlines()]
     (vcp,) = [r for r in rows if r[:2] == ["| Reacher-v2", "VCP"]]
-    # success .2 .4 .6 .8 1 1 and .21 .41 .61 .81 1 1, six epochs that both have
+    # success .2 .4 .6 .8 1 1 and .21 .41 .61 .81 1 1 1, six epochs that both have
     assert vcp[2:5] == ["2", "6", "5"]
-    assert vcp[5].startswith("0.670 (0.667-0.673)") and vcp[6].startswith("0.763 (0.760-0.766)")
-    (total,) = [r for r in rows if r[0] == "| VCP" and r[1] == "3"]
-    assert total[2].startswith("0.669")  # of .667 three times and .673 twice
+    assert vcp[5].startswith("0.670 (0.667-0.673)") and vcp[6].startswith("0.822 (0.760-0.884)")
+    # .35 and .36 twice, beside .667 and .673 twice; the schedule that only VCP has does not count
+    (total,) = [r for r in rows if r[0] == "| VCP, 4 heads" and len(r) == 4]
+    assert total[1] == "FetchReach-v1, Reacher-v2"
+    assert total[2].startswith("0.355 (0.35") and total[3].startswith("0.670 (0.66")
+    assert not [r for r in rows if r[0] == "| VCP"]
 
 
 def test_smoothing_and_statistics_by_hand():
