@@ -27,7 +27,7 @@ from her import EpisodeBuffer, HERReplay, relabel_future
 from options import Config
 from rollout import actor, evaluate, explorer, rollout
 from vcp import HERBuffer, in_thread, update_her_buffer
-from workers import ParallelEnvs
+from workers import ParallelEnvs, fast_products
 
 tqdm.monitor_interval = 0  # its watching thread would outlive a run
 
@@ -152,7 +152,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
         rows = saved["rows"]
         env_steps, start = rows[-1]["env_steps"], start - rows[-1]["wall_seconds"]
 
-    with ParallelEnvs(config.env, num_envs, config.num_workers, heads) as envs:
+    with ParallelEnvs(config.env, num_envs, config.num_workers, heads) as envs, fast_products():
         records.start(folder, asdict(config), rows, resume)
         print(describe(config.env))
         for epoch in range(len(rows) + 1, config.epochs + 1):  # line 2

@@ -37,7 +37,7 @@ from her import EpisodeBuffer, relabel_future
 from records import COLUMNS, TIMING_COLUMNS, read_rows
 from run import Config, train
 from vcp import HERBuffer, in_thread, update_her_buffer, value_consistency_priority
-from workers import ParallelEnvs, read_joints_by_index
+from workers import ParallelEnvs, fast_products, read_joints_by_index
 
 SMALL = {"epochs": 1, "cycles": 2, "updates": 2, "batch_size": 32, "eval_episodes": 16}
 
@@ -917,6 +917,23 @@ def test_workers_play_the_same_as_one_process(name):
                 np.testing.assert_array_equal(array[first], others[first])
         assert len({row.tobytes() for row in array}) == 8  # each environment has its own seed
         assert array.dtype == np.float32
+
+
+def test_fast_products_are_float32_or_left_alone(monkeypatch):
+    setting, x, w = torch.backends.mkldnn.matmul, torch.randn(256, 300), torch.randn(300, 256)
+    before = setting.fp32_precision
+    with pytest.raises(KeyError), fast_products():
+        assert (x @ w - x.double() @ w.double()).abs().max() < 1e-4
+        raise KeyError
+    assert setting.fp32_precision == before
+
+    def rounded(a, b):
+        return torch.mm(a.bfloat16().float(), b.bfloat16().float())
+
+    assert (rounded(x, w) - x @ w).abs().max() > 1e-2
+    monkeypatch.setattr(torch.Tensor, "__matmul__", rounded)  # a processor that rounds
+    with fast_products():
+        assert setting.fp32_precision == before
 
 
 def test_workers_hold_whole_heads_or_a_part_of_one():

@@ -40,6 +40,28 @@ def one_torch_thread():
         torch.set_num_threads(threads)
 
 
+def products_are_rounded() -> bool:
+    """Whether a product of float32 matrices loses digits that float32 has and bfloat16 has not."""
+    x = torch.full((256, 256), 1 + 2**-12)
+    return not torch.equal(x @ torch.eye(256), x)
+
+
+@contextmanager
+def fast_products():
+    """Multiply matrices with oneDNN in the block, where PyTorch by itself takes MKL, which leaves
+    half the width of an AMD processor's vectors unused. PyTorch asks oneDNN if rounding to bfloat16
+    is allowed; only processors with a unit for that (AMX) then do round, and for them MKL stays."""
+    products = torch.backends.mkldnn.matmul
+    before = products.fp32_precision
+    products.fp32_precision = "bf16"
+    if products_are_rounded():
+        products.fp32_precision = before
+    try:
+        yield
+    finally:
+        products.fp32_precision = before
+
+
 def read_joints_by_index(env: gym.Env) -> gym.Env:
     """Make a Fetch or Hand environment find its joints once. gymnasium-robotics looks each of them
     up by name at each step, a quarter to almost half of the step's time; the values are the same.
