@@ -44,9 +44,23 @@ def read_runs(folder: Path) -> list[Run]:
     return runs
 
 
+def paper_schedule(c: Config) -> tuple[int, int, int]:
+    """Appendix B's cycles, updates and batch size."""
+    return tuple(options.paper_schedule(c.env, c.method).values())[:3]
+
+
+def as_many_updates(c: Config) -> bool:
+    """Whether one network makes the updates that an ensemble of 16 makes."""
+    cycles, updates, batch_size = paper_schedule(c)
+    same = (c.cycles, c.updates, c.batch_size) == (cycles, 16 * updates, batch_size)
+    return c.heads == 1 and same
+
+
 def label(c: Config) -> str:
     """What the legend calls the run: its method and what is not the paper's default."""
     parts = [c.method.upper()]
+    if as_many_updates(c):
+        parts.append("16 times the updates")
     if c.heads != (16 if c.method == "vcp" else 1):
         parts.append(f"{c.heads} heads")
     if c.priority != "consistency":
@@ -63,7 +77,7 @@ ABLATIONS = ("VCP", "VCP, uniform priority", "VCP, variance priority", "VCP, one
 FIGURES = {  # name: (what it is, which runs by their label)
     "fig2": (
         "Figure 2: VCP (16 heads) and the other methods with one network",
-        lambda name: name in ("VCP", *map(str.upper, BASELINES)),
+        lambda name: name in ("VCP", *map(str.upper, BASELINES), "HER, 16 times the updates"),
     ),
     "fig4": ("Figure 4", lambda name: name == "VCP, relabel_ratio 0.5"),
     "fig6": ("Figure 6: ablations of VCP", lambda name: name in ABLATIONS),
@@ -105,8 +119,7 @@ def draw_line(ax: Axes, seeds: list[np.ndarray], style: int, text: str, smooth: 
 
 def schedule(c: Config) -> str:
     """What is other than in Appendix B, for a title: nothing or a line."""
-    paper = options.paper_schedule(c.env, c.method)
-    if (c.cycles, c.updates, c.batch_size) == tuple(paper.values())[:3]:
+    if (c.cycles, c.updates, c.batch_size) == paper_schedule(c) or as_many_updates(c):
         return ""
     return f"\n{c.cycles} cycles of {c.updates} updates of batch {c.batch_size}"
 

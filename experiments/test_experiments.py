@@ -42,6 +42,7 @@ def results(tmp_path):
         "one": {"acting_head": "one"},
         "four": {"heads": 4, "level": 0.5},
         "half": {"relabel_ratio": 0.5},
+        "more": {"method": "her", "heads": 1, "updates": 80},
         "other": {"temperature": 1.0},
         **{f"{m}{k}": {"method": m, "heads": k} for m in figures.BASELINES for k in (1, 16)},
     }
@@ -58,7 +59,14 @@ def results(tmp_path):
 @pytest.mark.parametrize(
     ("name", "lines"),
     [
-        ("fig2", ["VCP (2)", *(f"{m.upper()} (2)" for m in figures.BASELINES)]),
+        (
+            "fig2",
+            [
+                "VCP (2)",
+                "HER, 16 times the updates (2)",
+                *(f"{m.upper()} (2)" for m in figures.BASELINES),
+            ],
+        ),
         ("fig9", ["VCP (2)", *(f"{m.upper()}, 16 heads (2)" for m in figures.BASELINES)]),
         ("fig6", ["VCP (2)", "VCP, uniform priority (2)", "VCP, one acting head (2)"]),
         ("fig7", ["VCP (2)", "VCP, 4 heads (2)"]),
