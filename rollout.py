@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from ensemble import EnsembleDDPG
-from workers import ParallelEnvs, one_torch_thread
+from workers import ParallelEnvs, small_calls
 
 
 def rollout(envs: ParallelEnvs, policy, horizon: int) -> tuple[dict, np.ndarray]:
@@ -37,7 +37,7 @@ def rollout(envs: ParallelEnvs, policy, horizon: int) -> tuple[dict, np.ndarray]
         }
         return episodes, success
 
-    with one_torch_thread():
+    with small_calls():
         parts, successes = zip(*envs.each(play), strict=True)
     episodes = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     for name, array in episodes.items():

@@ -37,7 +37,7 @@ from her import EpisodeBuffer, relabel_future
 from records import COLUMNS, TIMING_COLUMNS, read_rows
 from run import Config, train
 from vcp import HERBuffer, in_thread, update_her_buffer, value_consistency_priority
-from workers import ParallelEnvs, fast_products, read_joints_by_index
+from workers import ParallelEnvs, fast_products, read_joints_by_index, small_calls
 
 SMALL = {"epochs": 1, "cycles": 2, "updates": 2, "batch_size": 32, "eval_episodes": 16}
 
@@ -922,8 +922,13 @@ def test_workers_play_the_same_as_one_process(name):
 def test_fast_products_are_float32_or_left_alone(monkeypatch):
     setting, x, w = torch.backends.mkldnn.matmul, torch.randn(256, 300), torch.randn(300, 256)
     before = setting.fp32_precision
+    threads = torch.get_num_threads()
     with pytest.raises(KeyError), fast_products():
         assert (x @ w - x.double() @ w.double()).abs().max() < 1e-4
+        inside = setting.fp32_precision
+        with small_calls():
+            assert torch.get_num_threads() == 1 and setting.fp32_precision == "ieee"
+        assert torch.get_num_threads() == threads and setting.fp32_precision == inside
         raise KeyError
     assert setting.fp32_precision == before
 

@@ -29,15 +29,19 @@ def available_cores() -> list[int]:
 
 
 @contextmanager
-def one_torch_thread():
-    """Run the block's PyTorch calls on one thread: acting is too little work for more, and idle
-    threads that spin in wait for the next call would take the cores from the environments."""
-    threads = torch.get_num_threads()
+def small_calls():
+    """Run the block's PyTorch calls on one thread and without `fast_products`: acting is too little
+    work for more, and idle threads that spin in wait for the next call would take the cores from
+    the environments."""
+    products = torch.backends.mkldnn.matmul
+    threads, precision = torch.get_num_threads(), products.fp32_precision
     torch.set_num_threads(1)
+    products.fp32_precision = "ieee"
     try:
         yield
     finally:
         torch.set_num_threads(threads)
+        products.fp32_precision = precision
 
 
 def products_are_rounded() -> bool:
