@@ -920,9 +920,9 @@ def test_workers_play_the_same_as_one_process(name):
 
 
 def test_fast_products_are_float32_or_left_alone(monkeypatch):
+    torch.manual_seed(0)
     setting, x, w = torch.backends.mkldnn.matmul, torch.randn(256, 300), torch.randn(300, 256)
-    before = setting.fp32_precision
-    threads = torch.get_num_threads()
+    before, threads = setting.fp32_precision, torch.get_num_threads()
     with pytest.raises(KeyError), fast_products():
         assert (x @ w - x.double() @ w.double()).abs().max() < 1e-4
         inside = setting.fp32_precision

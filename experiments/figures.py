@@ -185,12 +185,12 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
     the last ones of each run, with 95 % intervals. For each method that shares more than one
     environment with VCP: the interquartile mean over all of the second for both, on the shared
     ones, with a bootstrap that draws seeds within each environment."""
-    curves = defaultdict(lambda: defaultdict(list))
+    success = defaultdict(lambda: defaultdict(list))
     for run in runs:
         key = run.config.env + schedule(run.config).replace("\n", ", ")
-        curves[key][label(run.config)].append(run.rows["test_success_rate"])
+        success[key][label(run.config)].append(run.rows["test_success_rate"])
     lines, means = [], defaultdict(dict)
-    for env, methods in sorted(curves.items()):
+    for env, methods in sorted(success.items()):
         epochs = min(len(curve) for seeds in methods.values() for curve in seeds)
         for name, seeds in sorted(methods.items()):
             firsts = [np.flatnonzero(curve >= 0.95)[:1] + 1 for curve in seeds]
