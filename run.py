@@ -27,7 +27,7 @@ from her import EpisodeBuffer, HERReplay, relabel_future
 from options import Config
 from rollout import actor, evaluate, explorer, rollout
 from vcp import HERBuffer, in_thread, update_her_buffer
-from workers import ParallelEnvs, fast_products
+from workers import ParallelEnvs, fast_products, without_denormals
 
 tqdm.monitor_interval = 0  # its watching thread would outlive a run
 
@@ -94,6 +94,7 @@ def make_replay(config: Config, env: gym.Env, original_buffer: EpisodeBuffer, re
     return dtgsh.DTGSH(*her, **common)
 
 
+@without_denormals()
 def train(config: Config, resume: bool = False) -> list[dict]:
     """Algorithm 2. Writes the run's folder and gives the rows of its progress.csv.
 

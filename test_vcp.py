@@ -941,6 +941,30 @@ def test_fast_products_are_float32_or_left_alone(monkeypatch):
         assert setting.fp32_precision == before
 
 
+def test_training_takes_denormals_for_zero_in_all_threads(tmp_path):
+    """In a process of its own: PyTorch's threads have the setting from when they are started."""
+    program = f"""
+import torch, run
+from ensemble import EnsembleDDPG
+def zeros():
+    return (torch.full((1_000_000,), 1e-20).square() == 0).float().mean().item()
+torch.set_num_threads(2)
+EnsembleDDPG.update_targets = lambda agent: print("zeros", zeros())
+run.train(run.Config(env="PointMassEmptyEnv-v1", out={str(tmp_path / "run")!r}, **{SMALL}))
+torch.set_num_threads(1)
+print("afterwards", zeros())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        cwd=Path(run.__file__).parent,
+    )
+    lines = done.stdout.splitlines()
+    assert lines.count("zeros 1.0") == SMALL["cycles"], done
+    assert lines[-1] == "afterwards 0.0"
+
+
 def test_workers_hold_whole_heads_or_a_part_of_one():
     for heads, num_envs, asked, made in (
         (16, 16, 5, 4),
