@@ -8,10 +8,12 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+import torch
 
 import options
+from ensemble import MultiHeadMLP, linear
 from envs_point import UsageError
-from experiments import didactic, effective, figures, sweep, variance_figures
+from experiments import didactic, effective, figures, plasticity, sweep, variance_figures
 from options import Config
 from records import COLUMNS, epochs_done
 from test_vcp import without_timing
@@ -142,6 +144,25 @@ def test_the_effective_sample_size(tmp_path, capsys):
     line = capsys.readouterr().out.splitlines()[-1].split(" | ")
     shares = [float(x.rstrip("% |")) for x in line[2:]]
     assert line[1] == "2" and len(shares) == 5 and shares == sorted(shares, reverse=True)
+
+
+def test_dead_and_saturated_units(tmp_path, capsys):
+    net = MultiHeadMLP(3, 2, 2, torch.tanh, torch.Generator().manual_seed(0))
+    net.heads[1][0, :64] = -1e6  # a quarter of one of two heads
+    net.trunk[3][:] = 1e6
+    embedding, units = plasticity.hidden(net, torch.randn(50, 3))
+    assert embedding.shape == (50, 256) and (embedding == 1).all() and units.shape == (2, 50, 256)
+    assert (units[0, :, :64] == 0).all()
+    x = torch.randn(50, 3)
+    outputs = torch.tanh(linear(plasticity.hidden(net, x)[1], *net.heads[2:]))
+    torch.testing.assert_close(outputs, net.forward_heads(x))
+    units = torch.zeros(2, 5, 4)
+    units[0, 3, 1] = units[1, :, 2] = 0.1  # alive: one of four in each head
+    assert plasticity.dead_share(units) == 0.75
+    sweep.main(arguments(tmp_path, "--task", "0"))
+    plasticity.main([str(tmp_path / "PointMassEmptyEnv-v1" / "vcp" / "seed0")])
+    line = capsys.readouterr().out.splitlines()[-1].split(" | ")
+    assert line[1] == "2" and all(0 <= int(x.rstrip("% |")) <= 100 for x in line[2:])
 
 
 def test_no_runs_is_said(tmp_path):

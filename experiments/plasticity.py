@@ -1,0 +1,66 @@
+"""What has become of the networks: python -m experiments.plasticity DIR...
+
+For the last checkpoint of each run and 4,096 transitions of its B_o: the share of the actor's trunk
+that is saturated (beyond ±.99), and the shares of the units of the heads' hidden layers that are 0
+for every one of the transitions, "dead", which learn no more.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import options
+import records
+from ensemble import MultiHeadMLP, linear
+from envs_point import UsageError, make_env
+from experiments.figures import label
+from run import make_agent
+
+
+@torch.no_grad()
+def hidden(net: MultiHeadMLP, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where the trunk ends, (B, H), and the heads' hidden layers, (K, B, H), for inputs (B, I)."""
+    w1, b1, w2, b2 = net.trunk
+    embedding = net.squash(linear(linear(x, w1, b1).relu(), w2, b2))
+    return embedding, linear(embedding, *net.heads[:2]).relu()
+
+
+def dead_share(units: torch.Tensor) -> float:
+    """The share of units that are 0 for all of the B inputs: (K, B, H) -> a number."""
+    return (units.amax(dim=1) == 0).float().mean().item()
+
+
+def main(folders: list[str]) -> None:
+    if not folders:
+        sys.exit("usage: python -m experiments.plasticity DIR...")
+    print("| run | epoch | actor's trunk saturated | actors' units dead | critics' units dead |")
+    print("|---|---|---|---|---|")
+    for folder in map(Path, folders):
+        config, saved = options.load(folder), records.load_checkpoint(folder)
+        if saved is None:
+            raise UsageError(f"{folder} holds no run with a whole epoch")
+        env = make_env(config.env)
+        agent = make_agent(config, env)
+        env.close()
+        agent.load_state_dict(saved["parts"][0])
+        episodes = {name: x.numpy() for name, x in saved["parts"][1].items()}
+        rng = np.random.default_rng(0)
+        e, t = (rng.integers(n, size=4096) for n in episodes["action"].shape[:2])
+        state = agent._state(episodes["obs"][e, t], episodes["desired_goal"][e])
+        action = agent._tensor(episodes["action"][e, t])
+        embedding, actors = hidden(agent.actor, state)
+        _, critics = hidden(agent.critic, torch.cat([state, action], 1))
+        saturated = (embedding.abs() > 0.99).float().mean().item()
+        shares = " | ".join(
+            f"{x:.0%}" for x in (saturated, dead_share(actors), dead_share(critics))
+        )
+        print(f"| {config.env}, {label(config)} | {len(saved['rows'])} | {shares} |")
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except UsageError as error:
+        sys.exit(f"plasticity.py: {error}")
