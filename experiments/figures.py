@@ -136,8 +136,8 @@ def curves(runs: list[Run], title: str, smooth: float, alone: bool) -> Figure:
         )
     compared = {env: methods for env, methods in by_env.items() if len(methods) > 1}
     by_env = by_env if alone else compared or by_env
-    columns = min(len(by_env), 5)
-    lines = -(-len(by_env) // columns)
+    lines = -(-len(by_env) // 5)
+    columns = -(-len(by_env) // lines)
     fig = Figure(figsize=(max(3.6 * columns, 5), 3.2 * lines + 0.6), layout="constrained")
     panels = fig.subplots(lines, columns, squeeze=False).flat
     for ax, (env, methods) in zip(panels, sorted(by_env.items()), strict=False):
