@@ -26,8 +26,9 @@ class MultiHeadMLP:
     """Figure 1(a) and Appendix B: a trunk of two layers that all heads share, then, for each head,
     one more layer of 256 units and an output.
 
-    `squash` is applied where the trunk ends and to the output: torch.tanh for the actor, None for
-    the critic (not in the paper: the released code leaves its trunks this way, without a ReLU).
+    Each hidden layer is followed by a ReLU, as in HER's code, where Appendix B takes the networks
+    from (the released code has none where the trunk ends: NOTES.md, "the end of the trunk").
+    `squash` is applied to the output: torch.tanh for the actor, None for the critic.
 
     The heads are stacked along a first axis, so one call evaluates all of them, and `head(k)` is a
     list of views into the same memory, so training head k changes exactly its slice and the trunk.
@@ -55,7 +56,7 @@ class MultiHeadMLP:
         """The network with the tensors `params`: `head(k)` maps (B, I) to (B, J)."""
         w1, b1, w2, b2, w3, b3, w4, b4 = params
         h = linear(x, w1, b1).relu_()  # in place: at this size a fresh array costs as much as it
-        h = self.squash(linear(h, w2, b2))  # the embedding of Figure 1(a)
+        h = linear(h, w2, b2).relu_()  # the embedding of Figure 1(a)
         h = linear(h, w3, b3).relu_()
         return self.squash(linear(h, w4, b4))
 

@@ -390,7 +390,8 @@ class PlainHead(nn.Module):
         super().__init__()
         w1, b1, w2, b2, w3, b3, w4, b4 = params
         end = [nn.Tanh()] if is_actor else []
-        self.trunk = trunk or nn.Sequential(self.layer(w1, b1), nn.ReLU(), self.layer(w2, b2), *end)
+        layers = [self.layer(w1, b1), nn.ReLU(), self.layer(w2, b2), nn.ReLU()]
+        self.trunk = trunk or nn.Sequential(*layers)
         self.head = nn.Sequential(self.layer(w3, b3), nn.ReLU(), self.layer(w4, b4), *end)
 
     @staticmethod

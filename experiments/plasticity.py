@@ -1,8 +1,8 @@
 """What has become of the networks: python -m experiments.plasticity DIR...
 
-For the last checkpoint of each run and 4,096 transitions of its B_o: the share of the actor's trunk
-that is saturated (beyond ±.99), and the shares of the units of the heads' hidden layers that are 0
-for every one of the transitions, "dead", which learn no more.
+For the last checkpoint of each run and 4,096 transitions of its B_o: the shares of the units where
+the trunks end, and of those of the heads' hidden layers, that are 0 for every one of the
+transitions, "dead", which learn no more.
 """
 
 import sys
@@ -21,10 +21,10 @@ from run import make_agent
 
 @torch.no_grad()
 def hidden(net: MultiHeadMLP, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where the trunk ends, (B, H), and the heads' hidden layers, (K, B, H), for inputs (B, I)."""
+    """Where the trunk ends, (1, B, H), and the heads' hidden layers, (K, B, H), for x (B, I)."""
     w1, b1, w2, b2 = net.trunk
-    embedding = net.squash(linear(linear(x, w1, b1).relu(), w2, b2))
-    return embedding, linear(embedding, *net.heads[:2]).relu()
+    embedding = linear(linear(x, w1, b1).relu(), w2, b2).relu()
+    return embedding[None], linear(embedding, *net.heads[:2]).relu()
 
 
 def dead_share(units: torch.Tensor) -> float:
@@ -35,8 +35,8 @@ def dead_share(units: torch.Tensor) -> float:
 def main(folders: list[str]) -> None:
     if not folders:
         sys.exit("usage: python -m experiments.plasticity DIR...")
-    print("| run | epoch | actor's trunk saturated | actors' units dead | critics' units dead |")
-    print("|---|---|---|---|---|")
+    print("| run | epoch | dead: actor's trunk | actors' heads | critic's trunk | critics' heads |")
+    print("|---|---|---|---|---|---|")
     for folder in map(Path, folders):
         config, saved = options.load(folder), records.load_checkpoint(folder)
         if saved is None:
@@ -50,12 +50,8 @@ def main(folders: list[str]) -> None:
         e, t = (rng.integers(n, size=4096) for n in episodes["action"].shape[:2])
         state = agent._state(episodes["obs"][e, t], episodes["desired_goal"][e])
         action = agent._tensor(episodes["action"][e, t])
-        embedding, actors = hidden(agent.actor, state)
-        _, critics = hidden(agent.critic, torch.cat([state, action], 1))
-        saturated = (embedding.abs() > 0.99).float().mean().item()
-        shares = " | ".join(
-            f"{x:.0%}" for x in (saturated, dead_share(actors), dead_share(critics))
-        )
+        layers = hidden(agent.actor, state) + hidden(agent.critic, torch.cat([state, action], 1))
+        shares = " | ".join(f"{dead_share(units):.0%}" for units in layers)
         print(f"| {config.env}, {label(config)} | {len(saved['rows'])} | {shares} |")
 
 
