@@ -224,8 +224,7 @@ class EnsembleDDPG:
         Not in the paper, which says 0.95 and that each head has its own target network; the
         released code does so. A head's network is its head and the trunk, so the trunk is averaged
         K times; the main trunk stands still meanwhile, and K steps of 0.95 are one step of 0.95^K.
-        With a single step for the trunk learning is several times slower (NOTES.md, "the trunk's
-        targets").
+        What a single step for the trunk changes is in NOTES.md, "the trunk's targets".
         """
         heads = len(self.optimizers)
         self._move_targets(trunk_step=1 - self.polyak**heads, head_step=1 - self.polyak)
