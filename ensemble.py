@@ -110,6 +110,8 @@ class EnsembleDDPG:
 
     All methods take and give NumPy arrays; actions are in [-1, 1].
     gamma: discount (the paper does not say; 1 - 1/T for episodes of T steps).
+    trunk_rate: the trunks' share of the learning rate. 1 is Algorithm 2 to the letter: the trunks
+        take K whole steps, one with each head. With 1/K these add up to one (NOTES.md).
     polyak: share of the old target kept in `update_targets` (Appendix B: 0.95).
     action_penalty: weight of mean(μ²) in the actor's loss (not in the paper; 1 in HER's code).
     """
@@ -123,6 +125,7 @@ class EnsembleDDPG:
         gamma: float,
         heads: int = 16,
         learning_rate: float = 1e-3,
+        trunk_rate: float = 1.0,
         polyak: float = 0.95,
         action_penalty: float = 1.0,
         device: str = "cpu",
@@ -143,16 +146,17 @@ class EnsembleDDPG:
         self.target_actor, self.target_critic = actor(), critic()
         self._move_targets(trunk_step=1.0, head_step=1.0)  # targets start as copies
         self.normalizer = Normalizer(state, device)
+
+        def adam(critic, actor):
+            for p in critic + actor:
+                p.requires_grad_()
+            trunks = {"params": critic[:4] + actor[:4], "lr": learning_rate * trunk_rate}
+            heads = {"params": critic[4:] + actor[4:]}
+            return torch.optim.Adam([trunks, heads], learning_rate, fused=True)
+
         # One Adam for each head's actor and critic: it holds the moments of the head's own tensors
         # AND this head's own moments of the shared trunks.
-        self.optimizers = [
-            torch.optim.Adam(
-                [p.requires_grad_() for p in (*self.critic.head(k), *self.actor.head(k))],
-                learning_rate,
-                fused=True,
-            )
-            for k in range(heads)
-        ]
+        self.optimizers = [adam(self.critic.head(k), self.actor.head(k)) for k in range(heads)]
 
     # ---------------------------------------------------------------- acting and scoring
 

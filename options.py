@@ -55,6 +55,7 @@ class Config:
     scored_per_update: int | None = None  # mini-batches through Algorithm 1 for one of all heads
     buffer_size: int = 1_000_000  # of B_o, in transitions
     learning_rate: float = 1e-3
+    trunk_rate: float = 1.0  # the shared trunks' share of it: 1 is the paper's, see NOTES.md
     polyak: float = 0.95
     noise: float = 0.2  # standard deviation of the exploration noise; actions are in [-1, 1]
     random_actions: float = 0.3  # share of actions that are uniformly random

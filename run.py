@@ -62,6 +62,7 @@ def make_agent(config: Config, env: gym.Env) -> EnsembleDDPG:
         heads=config.heads,
         gamma=1 - 1 / env.spec.max_episode_steps,
         learning_rate=config.learning_rate,
+        trunk_rate=config.trunk_rate,
         polyak=config.polyak,
         action_penalty=config.action_penalty,
         device=config.device,

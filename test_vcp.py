@@ -493,17 +493,21 @@ def test_networks_have_the_papers_size_and_start_like_their_targets():
     assert not torch.equal(agent.actor.heads[0], other.actor.heads[0])
 
 
-def test_updates_are_those_of_plain_ddpg():
+@pytest.mark.parametrize("trunk_rate", [1, 0.25])
+def test_updates_are_those_of_plain_ddpg(trunk_rate):
     """Eqs. (2) and (3), step by step, against plain modules, plain Adam and the textbook's loss:
-    own targets, clipping, weights, gradients before steps, a head's own moments of the trunk."""
-    agent = random_agent(heads=3)
+    own targets, clipping, weights, gradients before steps, a head's own moments of the trunk and
+    its rate."""
+    agent = random_agent(heads=3, trunk_rate=trunk_rate)
     actors, critics = plain_ensemble(agent.actor, True), plain_ensemble(agent.critic, False)
     target_actors = plain_ensemble(agent.target_actor, True)
     target_critics = plain_ensemble(agent.target_critic, False)
-    optimizers = [
-        (torch.optim.Adam(a.parameters(), lr=1e-3), torch.optim.Adam(c.parameters(), lr=1e-3))
-        for a, c in zip(actors, critics, strict=True)
-    ]
+
+    def adam(net):
+        trunk = {"params": net.trunk.parameters(), "lr": 1e-3 * trunk_rate}
+        return torch.optim.Adam([trunk, {"params": net.head.parameters()}], lr=1e-3)
+
+    optimizers = [(adam(a), adam(c)) for a, c in zip(actors, critics, strict=True)]
     for step, k in enumerate([1, 2, 1, 0, 1]):
         batch = random_batch(seed=step)
         state, next_state, action, reward, weight = as_tensors(agent, batch)
@@ -1265,7 +1269,7 @@ def test_the_schedule_is_appendix_b():
     assert {s[:3] for s in schedule.values()} == {(50, 40, 256)}
     c = Config()
     assert (c.heads, c.epochs, c.eval_episodes, c.buffer_size) == (16, 50, 160, 1_000_000)
-    assert (c.relabel_ratio, c.learning_rate, c.polyak) == (0.8, 1e-3, 0.95)
+    assert (c.relabel_ratio, c.learning_rate, c.trunk_rate, c.polyak) == (0.8, 1e-3, 1, 0.95)
     assert (c.noise, c.random_actions, c.action_penalty, c.temperature) == (0.2, 0.3, 1.0, 9.0)
 
 

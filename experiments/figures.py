@@ -67,7 +67,8 @@ def label(c: Config) -> str:
         parts.append(f"{c.priority} priority")
     if c.acting_head == "one":
         parts.append("one acting head")
-    for name in ("temperature", "importance", "relabel_ratio", "her_thread", "faithful"):
+    others = ("temperature", "importance", "relabel_ratio", "trunk_rate", "her_thread", "faithful")
+    for name in others:
         if getattr(c, name) != getattr(Config, name):
             parts.append(f"{name} {getattr(c, name)}")
     return ", ".join(parts)
