@@ -72,7 +72,7 @@ def start(*arguments, program=None, limit=None):
 
 def finish(process):
     """Exit code, stdout and stderr."""
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=600)
     return process.returncode, out, err
 
 
