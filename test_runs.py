@@ -148,16 +148,21 @@ def test_resuming_from_the_command_line(whole, tmp_path, capsys):
 @pytest.mark.slow
 def test_killed_at_ten_random_moments(whole, tmp_path):
     folder, rng = tmp_path / "run", random.Random(0)
-    for _ in range(10):
+
+    def go_on():
         begun = (folder / "config.json").exists()
         how = [f"--resume={folder}"] if begun else [*ARGUMENTS, f"--out={folder}"]
-        process = start(*how, "--epochs=4")
-        time.sleep(
-            rng.uniform(0.5, 8)
-        )  # a whole run takes about that, half of it to import PyTorch
+        return start(*how, "--epochs=4")
+
+    began = time.monotonic()
+    assert finish(start(*ARGUMENTS, f"--out={tmp_path / 'timed'}", "--epochs=4"))[0] == 0
+    seconds = time.monotonic() - began  # half of it to import PyTorch
+    for _ in range(10):
+        process = go_on()
+        time.sleep(rng.uniform(0.1, 1) * seconds)
         os.killpg(process.pid, signal.SIGKILL)
         finish(process)
-    code, _, err = finish(start(f"--resume={folder}", "--epochs=4"))
+    code, _, err = finish(go_on())
     assert code == 0, err
     assert_same_run(whole, folder)
 
