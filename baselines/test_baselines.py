@@ -400,9 +400,9 @@ def test_k_dpp_of_goals_that_are_close_or_equal():
     for faithful in (False, True):
         items = sample_k_dpp(kernel, 64, rng, faithful)
         assert all(len(set(s)) == 64 for s in items.tolist())
-    # with 50 pairs of equal goals, 48.4 of them on average, 43.6 by 64 drawn at random
+    # with 50 pairs of equal goals, 48.7 of them on average, 43.6 by 64 drawn at random
     pairs = sample_k_dpp(np.repeat(kernel[1:2], 40, axis=0), 64, rng) % 50
-    assert np.mean([len(set(p)) for p in pairs.tolist()]) > 47
+    assert np.mean([len(set(p)) for p in pairs.tolist()]) > 48
     ones = sample_k_dpp(np.ones((20_000, 5, 5)), 2, rng)
     assert_frequencies(np.bincount(ones.reshape(-1), minlength=5), np.full(5, 0.2))
 
