@@ -111,7 +111,8 @@ class EnsembleDDPG:
     All methods take and give NumPy arrays; actions are in [-1, 1].
     gamma: discount (the paper does not say; 1 - 1/T for episodes of T steps).
     trunk_rate: the trunks' share of the learning rate. 1 is Algorithm 2 to the letter: the trunks
-        take K whole steps, one with each head. With 1/K these add up to one (NOTES.md).
+        take K whole steps, one with each head. With 1/K these add up to one, which is what many
+        updates in a cycle need (NOTES.md, "the trunk's step").
     polyak: share of the old target kept in `update_targets` (Appendix B: 0.95).
     action_penalty: weight of mean(μ²) in the actor's loss (not in the paper; 1 in HER's code).
     """
@@ -131,7 +132,8 @@ class EnsembleDDPG:
         device: str = "cpu",
         seed: int = 0,
     ):
-        self.gamma, self.polyak, self.action_penalty = gamma, polyak, action_penalty
+        self.heads, self.gamma, self.polyak = heads, gamma, polyak
+        self.action_penalty = action_penalty
         self.device = torch.device(device)
         generator = torch.Generator().manual_seed(seed)
         state = obs_dim + goal_dim
@@ -147,16 +149,16 @@ class EnsembleDDPG:
         self._move_targets(trunk_step=1.0, head_step=1.0)  # targets start as copies
         self.normalizer = Normalizer(state, device)
 
-        def adam(critic, actor):
-            for p in critic + actor:
-                p.requires_grad_()
-            trunks = {"params": critic[:4] + actor[:4], "lr": learning_rate * trunk_rate}
-            heads = {"params": critic[4:] + actor[4:]}
-            return torch.optim.Adam([trunks, heads], learning_rate, fused=True)
-
-        # One Adam for each head's actor and critic: it holds the moments of the head's own tensors
-        # AND this head's own moments of the shared trunks.
-        self.optimizers = [adam(self.critic.head(k), self.actor.head(k)) for k in range(heads)]
+        # One Adam for everything; it passes over the heads that are not updated, which have no
+        # gradient. With an Adam for each head, each with moments of its own for the trunks, as in
+        # the released code, the trunks die (NOTES.md, "the trunks' Adam").
+        nets = (self.actor, self.critic)
+        trunks = [p for net in nets for p in net.trunk]
+        own = [p for net in nets for k in range(heads) for p in net.head(k)[4:]]
+        for p in trunks + own:
+            p.requires_grad_()
+        rates = [{"params": trunks, "lr": learning_rate * trunk_rate}, {"params": own}]
+        self.optimizer = torch.optim.Adam(rates, learning_rate, fused=True)
 
     # ---------------------------------------------------------------- acting and scoring
 
@@ -217,9 +219,9 @@ class EnsembleDDPG:
         actor_loss = -(weight * policy_q).mean()
         actor_loss = actor_loss + self.action_penalty * (weight * policy.square()).mean()
 
-        self.optimizers[k].zero_grad()
+        self.optimizer.zero_grad()
         (critic_loss + actor_loss).backward()  # they have no parameter in common
-        self.optimizers[k].step()
+        self.optimizer.step()
         return torch.stack([critic_loss, actor_loss]).detach()
 
     def update_targets(self) -> None:
@@ -230,8 +232,8 @@ class EnsembleDDPG:
         K times; the main trunk stands still meanwhile, and K steps of 0.95 are one step of 0.95^K.
         What a single step for the trunk changes is in NOTES.md, "the trunk's targets".
         """
-        heads = len(self.optimizers)
-        self._move_targets(trunk_step=1 - self.polyak**heads, head_step=1 - self.polyak)
+        trunk_step = 1 - self.polyak**self.heads
+        self._move_targets(trunk_step, head_step=1 - self.polyak)
 
     @torch.no_grad()
     def _move_targets(self, trunk_step: float, head_step: float) -> None:
@@ -245,10 +247,10 @@ class EnsembleDDPG:
         return [self.actor, self.critic, self.target_actor, self.target_critic]
 
     def state_dict(self) -> dict:
-        """Networks, targets, every optimiser's moments and the normaliser, as tensors."""
+        """Networks, targets, the optimiser's moments and the normaliser, as tensors."""
         return {
             "networks": [[p.detach() for p in net.trunk + net.heads] for net in self._networks()],
-            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
+            "optimizer": self.optimizer.state_dict(),
             "normalizer": self.normalizer.state_dict(),
         }
 
@@ -258,8 +260,7 @@ class EnsembleDDPG:
         for net, saved in zip(self._networks(), state["networks"], strict=True):
             for p, value in zip(net.trunk + net.heads, saved, strict=True):
                 p.copy_(value)
-        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
-            optimizer.load_state_dict(saved)
+        self.optimizer.load_state_dict(state["optimizer"])
         self.normalizer.load_state_dict(state["normalizer"])
 
     # ---------------------------------------------------------------- NumPy to network

@@ -475,7 +475,7 @@ def test_the_ensemble_is_16_separate_networks():
 
 def test_networks_have_the_papers_size_and_start_like_their_targets():
     agent = EnsembleDDPG(10, 3, 4, gamma=0.98)
-    assert HIDDEN == 256 and len(agent.optimizers) == 16
+    assert HIDDEN == 256 and agent.heads == 16
     assert [tuple(p.shape) for p in agent.critic.head(3)] == [
         (256, 17), (256,), (256, 256), (256,), (256, 256), (256,), (1, 256), (1,),
     ]  # fmt: skip
@@ -497,18 +497,19 @@ def test_networks_have_the_papers_size_and_start_like_their_targets():
 @pytest.mark.parametrize("trunk_rate", [1, 0.25])
 def test_updates_are_those_of_plain_ddpg(trunk_rate):
     """Eqs. (2) and (3), step by step, against plain modules, plain Adam and the textbook's loss:
-    own targets, clipping, weights, gradients before steps, a head's own moments of the trunk and
+    own targets, clipping, weights, gradients before steps, one Adam of the trunk for all heads and
     its rate."""
     agent = random_agent(heads=3, trunk_rate=trunk_rate)
     actors, critics = plain_ensemble(agent.actor, True), plain_ensemble(agent.critic, False)
     target_actors = plain_ensemble(agent.target_actor, True)
     target_critics = plain_ensemble(agent.target_critic, False)
 
-    def adam(net):
-        trunk = {"params": net.trunk.parameters(), "lr": 1e-3 * trunk_rate}
-        return torch.optim.Adam([trunk, {"params": net.head.parameters()}], lr=1e-3)
+    def adams(nets):
+        trunk = torch.optim.Adam(nets[0].trunk.parameters(), lr=1e-3 * trunk_rate)
+        return [(trunk, torch.optim.Adam(net.head.parameters(), lr=1e-3)) for net in nets]
 
-    optimizers = [(adam(a), adam(c)) for a, c in zip(actors, critics, strict=True)]
+    assert all(net.trunk is nets[0].trunk for nets in (actors, critics) for net in nets)
+    optimizers = [a + c for a, c in zip(adams(actors), adams(critics), strict=True)]
     for step, k in enumerate([1, 2, 1, 0, 1]):
         batch = random_batch(seed=step)
         state, next_state, action, reward, weight = as_tensors(agent, batch)
@@ -518,16 +519,15 @@ def test_updates_are_those_of_plain_ddpg(trunk_rate):
         critic_loss = (weight * (critics[k](state, action) - y) ** 2).mean()
         pi = actors[k](state)
         actor_loss = -(weight * critics[k](state, pi)).mean() + (weight * pi**2).mean()
-        actor_optimizer, critic_optimizer = optimizers[k]
-        critic_optimizer.zero_grad()
+        for optimizer in optimizers[k]:
+            optimizer.zero_grad()
         critic_loss.backward(retain_graph=True)
         critic_grads = [p.grad.clone() for p in critics[k].parameters()]
-        actor_optimizer.zero_grad()
         actor_loss.backward()
         for p, g in zip(critics[k].parameters(), critic_grads, strict=True):
             p.grad = g  # without what the actor's loss left there
-        critic_optimizer.step()
-        actor_optimizer.step()
+        for optimizer in optimizers[k]:
+            optimizer.step()
         losses = agent.update_head(k, batch)
         torch.testing.assert_close(
             losses, torch.stack([critic_loss, actor_loss]).detach(), rtol=1e-4, atol=1e-5

@@ -16,6 +16,7 @@ from envs_point import UsageError
 from experiments import didactic, effective, figures, plasticity, sweep, variance_figures
 from options import Config
 from records import COLUMNS, epochs_done
+from run import train
 from test_vcp import without_timing
 from vcp import value_consistency_priority
 
@@ -163,6 +164,17 @@ def test_dead_units(tmp_path, capsys):
     plasticity.main([str(tmp_path / "PointMassEmptyEnv-v1" / "vcp" / "seed0")])
     line = capsys.readouterr().out.splitlines()[-1].split(" | ")
     assert line[1] == "2" and all(0 <= int(x.rstrip("% |")) <= 100 for x in line[2:])
+
+
+@pytest.mark.slow
+def test_the_trunk_outlives_the_first_cycle(tmp_path, capsys):
+    """With an Adam for each head, and so K moments of the trunk, four fifths of the actors'
+    trunk are dead after 40 updates (NOTES.md, "the trunks' Adam")."""
+    settings = {"env": "FetchPush-v1", "epochs": 1, "cycles": 1, "batch_size": 64}
+    train(Config(**settings, eval_episodes=16, num_workers=1, out=str(tmp_path)))
+    plasticity.main([str(tmp_path)])
+    line = capsys.readouterr().out.splitlines()[-1].split(" | ")
+    assert line[1] == "1" and int(line[2].rstrip("%")) < 30
 
 
 def test_no_runs_is_said(tmp_path):
