@@ -105,14 +105,13 @@ class Normalizer:
 
 
 class EnsembleDDPG:
-    """DDPG with K heads, Section 4.1: head k has its own actor, critic, target actor, target critic
-    and optimiser state, and is trained on mini-batches of its own (Algorithm 2, lines 14-17).
+    """DDPG with K heads, Section 4.1: head k has its own actor, critic, target actor and target
+    critic, and is trained on mini-batches of its own (Algorithm 2, lines 14-17).
 
     All methods take and give NumPy arrays; actions are in [-1, 1].
     gamma: discount (the paper does not say; 1 - 1/T for episodes of T steps).
     trunk_rate: the trunks' share of the learning rate. 1 is Algorithm 2 to the letter: the trunks
-        take K whole steps, one with each head. With 1/K these add up to one, which is what many
-        updates in a cycle need (NOTES.md, "the trunk's step").
+        take K whole steps, one with each head. With 1/K these add up to one (NOTES.md).
     polyak: share of the old target kept in `update_targets` (Appendix B: 0.95).
     action_penalty: weight of mean(μ²) in the actor's loss (not in the paper; 1 in HER's code).
     """
