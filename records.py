@@ -40,6 +40,7 @@ COLUMNS = [
 TIMING_COLUMNS = {name for name in COLUMNS if name.endswith("_seconds")}
 PACKAGES = ("numpy", "torch", "gymnasium", "gymnasium-robotics", "mujoco")
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
+FORMAT = 2  # of checkpoints; those without it have an Adam for each head, and are refused
 
 
 def write_whole(path: Path, write) -> None:
@@ -111,7 +112,7 @@ def save_checkpoint(folder: Path, state: dict) -> None:
 
     def save(file):
         try:
-            torch.save(state, file)
+            torch.save({"format": FORMAT, **state}, file)
         except RuntimeError as error:  # torch's own, from closing its archive on a full disk
             raise error.__context__ if isinstance(error.__context__, OSError) else error from None
 
@@ -123,14 +124,19 @@ def save_checkpoint(folder: Path, state: dict) -> None:
 
 
 def load_checkpoint(folder: Path) -> dict | None:
-    """The newest readable checkpoint; None if the run has none yet. UsageError if none is whole."""
+    """The newest readable checkpoint; None if the run has none yet. UsageError if none is whole, or
+    if it is another version's."""
     paths = [folder / name for name in ("checkpoint.new.pt", CHECKPOINT, PREVIOUS)]
     found = [path for path in paths if path.exists()]
     for path in found:
         try:
-            return torch.load(path, map_location="cpu", weights_only=True)
+            saved = torch.load(path, map_location="cpu", weights_only=True)
         except (RuntimeError, EOFError, OSError, pickle.UnpicklingError) as error:
             print(f"{path} is damaged ({type(error).__name__}), trying the one before")
+            continue
+        if saved.get("format") != FORMAT:
+            raise UsageError(f"{path} is a checkpoint of another version")
+        return saved
     if found:
         raise UsageError(f"no checkpoint in {folder} can be read: they are damaged")
     return None

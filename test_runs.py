@@ -233,6 +233,18 @@ def test_a_damaged_checkpoint_is_refused_and_the_one_before_is_used(whole, tmp_p
     assert before == sorted((p.name, p.stat().st_mtime) for p in folder.iterdir())
 
 
+@pytest.mark.parametrize("option", ["--resume", "--play"])
+def test_a_checkpoint_of_another_version_is_refused(option, tmp_path, capsys):
+    run.main([*ARGUMENTS, "--epochs=1", f"--out={tmp_path}"])
+    path = tmp_path / records.CHECKPOINT
+    torch.save({**torch.load(path, weights_only=True), "format": 1}, path)
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        run.main([f"{option}={tmp_path}"])
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and "another version" in err and err.count("\n") == 1
+
+
 # ------------------------------------------------------------------------------ stopping
 
 
