@@ -2,6 +2,7 @@
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 BLUE, GREEN, RED = "#0072B2", "#009E73", "#D55E00"
 STAGES = (1, 4, 10)  # epochs of Figure 5
@@ -39,7 +40,8 @@ def figure_3(data: dict[str, np.ndarray]) -> Figure:
         ax.plot(*xy[t], "k^", markersize=9, label="ŝ")
         ax.set_title(f"rank correlation with\nthe distance: {r:+.2f}", fontsize=8)
         ax.set(aspect="equal", xlim=(-0.62, 0.62), ylim=(-0.62, 0.62), xticks=[], yticks=[])
-        fig.colorbar(points, ax=ax, shrink=0.7, location="bottom").ax.tick_params(labelsize=6)
+        bar = fig.colorbar(points, ax=ax, shrink=0.7, location="bottom", ticks=MaxNLocator(4))
+        bar.ax.tick_params(labelsize=6)
     panels[0].legend(fontsize=7)
     fig.suptitle(
         "Figure 3: log₁₀ of the variance of ŝ with each achieved goal of its trajectory\n"
