@@ -1280,8 +1280,8 @@ def test_the_schedule_is_appendix_b():
 
 @pytest.mark.slow
 def test_point_mass_is_learned_and_not_without_relabelling(tmp_path):
-    settings = {"env": "PointMassEmptyEnv-v1", "epochs": 2, "updates": 5, "batch_size": 64}
+    settings = {"env": "PointMassEmptyEnv-v1", "epochs": 3, "updates": 5, "batch_size": 64}
     learned = train(Config(**settings, out=str(tmp_path / "her")))
-    assert learned[-1]["test_success_rate"] >= 0.7
+    assert max(row["test_success_rate"] for row in learned) >= 0.9
     control = train(Config(**settings, relabel_ratio=0.0, out=str(tmp_path / "no")))
     assert max(row["test_success_rate"] for row in control) < 0.2
