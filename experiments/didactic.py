@@ -1,7 +1,7 @@
 """The data behind Figures 3, 5 and 8, from runs on PointMassEmpty: python -m experiments.didactic
 
 Trains the runs below runs/didactic, or goes on with them, and writes what the figures need of their
-networks and buffers to results/didactic/NAME.npz. Figure 4's runs are among them: half originals.
+networks and buffers to results/didactic/NAME.npz. Figure 4's run is among them: half16.
 """
 
 import argparse
@@ -89,11 +89,15 @@ def figure_5(config: Config) -> dict[str, np.ndarray]:
 
 
 def figure_8(config: Config) -> dict[str, np.ndarray]:
-    """Section 5.8: the variance of every transition of B_h, now, and which are hindsight's."""
+    """Section 5.8: of every transition of B_h the variance now, the probability to be drawn, and
+    whether it is hindsight's, (N,) each."""
     agent, _, her_buffer = trained(config, EPOCH)
     rows = {name: x[: her_buffer.size] for name, x in her_buffer.data.items()}
-    variance = agent.q_variance(rows["obs"], rows["action"], rows["goal"])
-    return {"variance": variance, "hindsight": rows["hindsight"]}
+    return {
+        "variance": agent.q_variance(rows["obs"], rows["action"], rows["goal"]),
+        "probability": her_buffer.probabilities.astype(np.float32),
+        "hindsight": rows["hindsight"],
+    }
 
 
 def jobs(out: Path) -> dict:
@@ -102,12 +106,13 @@ def jobs(out: Path) -> dict:
     def config(name, **settings):
         return Config(**SCHEDULE, **settings, out=str(out / name))
 
-    half = {"relabel_ratio": 0.5, "buffer_size": 10_000}
+    half = {"relabel_ratio": 0.5}  # Sections 5.4, 5.5, 5.8
+    small = {**half, "buffer_size": 10_000}  # Figure 5's caption
     return {
         "fig3": (figure_3, config("heads16")),
-        **{f"fig8_{k}": (figure_8, config(f"heads{k}", heads=k)) for k in SIZES},
-        "fig5_consistency": (figure_5, config("half_consistency", **half)),
-        "fig5_variance": (figure_5, config("half_variance", **half, priority="variance")),
+        **{f"fig8_{k}": (figure_8, config(f"half{k}", **half, heads=k)) for k in SIZES},
+        "fig5_consistency": (figure_5, config("small_consistency", **small)),
+        "fig5_variance": (figure_5, config("small_variance", **small, priority="variance")),
     }
 
 
@@ -121,15 +126,15 @@ def main() -> None:
     made = jobs(Path(given.out))
     if unknown := set(given.names) - made.keys():
         parser.error(f"no {', '.join(sorted(unknown))}; there are {', '.join(made)}")
-    folder = RESULTS / "didactic"
-    folder.mkdir(parents=True, exist_ok=True)
     try:
-        for name in given.names or made:
-            function, config = made[name]
-            np.savez_compressed(folder / f"{name}.npz", **function(config))
-            print(folder / f"{name}.npz")
+        arrays = {name: made[name][0](made[name][1]) for name in given.names or made}
     except UsageError as error:
         parser.error(str(error))
+    folder = RESULTS / "didactic"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, its in arrays.items():  # after all runs, which note whether the work tree is clean
+        np.savez_compressed(folder / f"{name}.npz", **its)
+        print(folder / f"{name}.npz")
 
 
 if __name__ == "__main__":

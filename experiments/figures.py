@@ -67,8 +67,8 @@ def label(c: Config) -> str:
         parts.append(f"{c.priority} priority")
     if c.acting_head == "one":
         parts.append("one acting head")
-    others = ("temperature", "importance", "relabel_ratio", "trunk_rate", "her_thread", "faithful")
-    for name in others:
+    others = ("temperature", "importance", "relabel_ratio", "buffer_size", "trunk_rate")
+    for name in (*others, "her_thread", "faithful"):
         if getattr(c, name) != getattr(Config, name):
             parts.append(f"{name} {getattr(c, name)}")
     return ", ".join(parts)

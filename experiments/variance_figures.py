@@ -93,7 +93,8 @@ def figure_5(data: dict[str, dict[str, np.ndarray]]) -> Figure:
 
 
 def figure_8(data: dict[int, dict[str, np.ndarray]]) -> Figure:
-    """Figure 8: histograms of the variance in B_h for ensembles of K heads. data: arrays by K."""
+    """Figure 8: histograms of the variance in B_h for ensembles of K heads, and how often the
+    priority draws an original transition (Section 5.8). data: arrays by K."""
     fig = Figure(figsize=(5.2, 1.5 * len(data) + 0.6), layout="constrained")
     panels = fig.subplots(len(data), 1, sharex=True)
     positive = np.concatenate([d["variance"] for d in data.values()])
@@ -105,11 +106,15 @@ def figure_8(data: dict[int, dict[str, np.ndarray]]) -> Figure:
             name = "hindsight" if kind else "original"
             ax.hist(variance, bins, color=colour, alpha=0.6, density=False, label=name)
             ax.axvline(np.median(variance), color=colour, linestyle="--", linewidth=1)
+        original = ~d["hindsight"]
+        share, drawn = original.mean(), d["probability"][original].sum()
         ax.set(xscale="log", ylabel=f"K = {k}")
+        ax.set_title(f"originals: {share:.1%} of B_h, {drawn:.1%} of the draws", fontsize=7)
     panels[0].legend(fontsize=7)
     panels[-1].set_xlabel("variance of the K Q-values in B_h (dashed: medians)")
     fig.suptitle(
-        "Figure 8: PointMassEmptyEnv-v1, 5 updates of batch 64 a cycle,\nepoch 10, one seed",
+        "Figure 8: PointMassEmptyEnv-v1, half originals,\n"
+        "5 updates of batch 64 a cycle, epoch 10, one seed",
         fontsize=9,
     )
     return fig
