@@ -119,6 +119,9 @@ def test_the_figures_of_variances(tmp_path, monkeypatch, capsys):
     assert (data["variance"] > 0).all()
     data = dict(np.load(tmp_path / "didactic" / "fig5_variance.npz"))
     assert {data[f"{kind}_2"].shape for kind in ("original", "her", "drawn")} == {(40, 4)}
+    data = dict(np.load(tmp_path / "didactic" / "fig8_4.npz"))
+    assert 0.35 < data["hindsight"].mean() < 0.65  # half originals
+    np.testing.assert_allclose(data["probability"].sum(), 1, rtol=1e-5)
     for name in ("fig3", "fig8"):
         assert figures.draw(name, tmp_path).read_bytes()[:4] == b"\x89PNG"
     if importlib.util.find_spec("sklearn"):
