@@ -93,6 +93,7 @@ def test_each_figure_has_its_runs(name, lines, results, monkeypatch):
     alone = {"FetchReach-v1\n5 cycles of 2 updates of batch 64": ["VCP (1)"]}
     assert drawn == (alone if name == "fig2" else {})
     assert figures.label(Config(temperature=1.0, method="vcp")) == "VCP, temperature 1.0"
+    assert figures.label(Config(buffer_size=10_000)) == "VCP, buffer_size 10000"
 
 
 def test_figure_4(results):
@@ -134,6 +135,14 @@ def test_the_correlation_with_the_distance():
     variance = np.stack([distance[0] ** 3, -distance[1]])
     r = variance_figures.distance_correlation({"xy": xy, "t": [3, 3], "variance": variance})
     np.testing.assert_allclose(r, [1, -1])
+
+
+def test_figure_8_says_how_often_originals_are_drawn():
+    hindsight, p = np.array([True, True, True, False]), np.array([0.1, 0.2, 0.3, 0.4])
+    variance = np.array([1.0, 2, 3, 4])
+    data = {"variance": variance, "probability": p, "hindsight": hindsight}
+    fig = variance_figures.figure_8({2: data})
+    assert fig.axes[0].get_title() == "originals: 25.0% of B_h, 40.0% of the draws"
 
 
 def test_the_effective_sample_size(tmp_path, capsys):

@@ -96,7 +96,7 @@ def figure_8(data: dict[int, dict[str, np.ndarray]]) -> Figure:
     """Figure 8: histograms of the variance in B_h for ensembles of K heads, and how often the
     priority draws an original transition (Section 5.8). data: arrays by K."""
     fig = Figure(figsize=(5.2, 1.5 * len(data) + 0.6), layout="constrained")
-    panels = fig.subplots(len(data), 1, sharex=True)
+    panels = fig.subplots(len(data), 1, sharex=True, squeeze=False)[:, 0]
     positive = np.concatenate([d["variance"] for d in data.values()])
     low, high = np.quantile(positive[positive > 0], [0.001, 1])
     bins = np.geomspace(low, high, 60)
