@@ -55,7 +55,7 @@ class Config:
     scored_per_update: int | None = None  # mini-batches through Algorithm 1 for one of all heads
     buffer_size: int = 1_000_000  # of B_o, in transitions
     learning_rate: float = 1e-3
-    trunk_rate: float = 1.0  # the shared trunks' share of it: 1 is the paper's, see NOTES.md
+    trunk_rate: float | None = None  # the shared trunks' share; None: `trunk_rate` below
     polyak: float = 0.95
     noise: float = 0.2  # standard deviation of the exploration noise; actions are in [-1, 1]
     random_actions: float = 0.3  # share of actions that are uniformly random
@@ -80,6 +80,13 @@ def paper_schedule(env: str, method: str = "vcp") -> dict[str, int]:
     return {"cycles": 50, "updates": 40, "batch_size": 256, "scored_per_update": 1}
 
 
+def trunk_rate(updates: int, heads: int) -> float:
+    """The trunks' share of the learning rate where none is given (not in the paper). With few
+    updates a cycle, 1, Algorithm 2 to the letter: the trunks take K whole steps, one with each
+    head. With many these K steps add up to one (NOTES.md, "The trunk's step")."""
+    return 1.0 if updates <= 5 else 1 / heads
+
+
 def complete(config: Config) -> Config:
     """A copy with schedule, device and folder filled in. UsageError for a setting out of range."""
     given = {name: value for name, value in asdict(config).items() if value is not None}
@@ -101,6 +108,8 @@ def complete(config: Config) -> Config:
         raise UsageError(f"--seed must be 0 or more, not {config.seed}")
     if not math.isfinite(config.temperature):
         raise UsageError(f"--temperature must be a finite number, not {config.temperature}")
+    if config.trunk_rate is None:
+        config.trunk_rate = trunk_rate(config.updates, config.heads)
     if config.device == "auto":
         config.device = "cuda" if torch.cuda.is_available() else "cpu"
     if config.device == "cuda" and not torch.cuda.is_available():

@@ -1274,8 +1274,28 @@ def test_the_schedule_is_appendix_b():
     assert {s[:3] for s in schedule.values()} == {(50, 40, 256)}
     c = Config()
     assert (c.heads, c.epochs, c.eval_episodes, c.buffer_size) == (16, 50, 160, 1_000_000)
-    assert (c.relabel_ratio, c.learning_rate, c.trunk_rate, c.polyak) == (0.8, 1e-3, 1, 0.95)
+    assert (c.relabel_ratio, c.learning_rate, c.polyak) == (0.8, 1e-3, 0.95)
     assert (c.noise, c.random_actions, c.action_penalty, c.temperature) == (0.2, 0.3, 1.0, 9.0)
+
+
+@pytest.mark.parametrize(
+    "settings, rate",
+    [
+        ({}, 1),
+        ({"env": "FetchPush-v1"}, 1 / 16),
+        ({"env": "FetchPush-v1", "updates": 5}, 1),
+        ({"env": "HandReach-v0", "heads": 4, "method": "dtgsh"}, 1 / 4),
+        ({"env": "FetchPush-v1", "heads": 1, "method": "her"}, 1),
+        ({"env": "FetchPush-v1", "trunk_rate": 0.5}, 0.5),
+    ],
+)
+def test_with_many_updates_the_trunks_steps_add_up_to_one(settings, rate):
+    config = options.complete(Config(**settings))
+    assert config.trunk_rate == rate
+    env = make_env(config.env)
+    env.close()
+    groups = run.make_agent(config, env).optimizer.param_groups
+    assert [group["lr"] for group in groups] == [1e-3 * rate, 1e-3]
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import argparse
 import re
 import sys
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -67,9 +67,10 @@ def label(c: Config) -> str:
         parts.append(f"{c.priority} priority")
     if c.acting_head == "one":
         parts.append("one acting head")
+    default = replace(Config(), trunk_rate=options.trunk_rate(c.updates, c.heads))
     others = ("temperature", "importance", "relabel_ratio", "buffer_size", "trunk_rate")
     for name in (*others, "her_thread", "faithful"):
-        if getattr(c, name) != getattr(Config, name):
+        if getattr(c, name) != getattr(default, name):
             parts.append(f"{name} {getattr(c, name)}")
     return ", ".join(parts)
 

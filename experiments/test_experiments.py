@@ -92,8 +92,20 @@ def test_each_figure_has_its_runs(name, lines, results, monkeypatch):
     # another schedule is another panel, which says so
     alone = {"FetchReach-v1\n5 cycles of 2 updates of batch 64": ["VCP (1)"]}
     assert drawn == (alone if name == "fig2" else {})
-    assert figures.label(Config(temperature=1.0, method="vcp")) == "VCP, temperature 1.0"
-    assert figures.label(Config(buffer_size=10_000)) == "VCP, buffer_size 10000"
+
+
+@pytest.mark.parametrize(
+    "settings, label",
+    [
+        ({"temperature": 1.0}, "VCP, temperature 1.0"),
+        ({"buffer_size": 10_000}, "VCP, buffer_size 10000"),
+        ({"env": "FetchPush-v1"}, "VCP"),
+        ({"env": "FetchPush-v1", "trunk_rate": 1.0}, "VCP, trunk_rate 1.0"),
+        ({"trunk_rate": 0.0625}, "VCP, trunk_rate 0.0625"),
+    ],
+)
+def test_the_label_names_what_is_not_the_default(settings, label):
+    assert figures.label(options.complete(Config(**settings))) == label
 
 
 def test_figure_4(results):
@@ -182,7 +194,7 @@ def test_dead_units(tmp_path, capsys):
 def test_the_trunk_outlives_the_first_cycle(tmp_path, capsys):
     """With an Adam for each head, and so K moments of the trunk, four fifths of the actors'
     trunk are dead after 40 updates (NOTES.md, "the trunks' Adam")."""
-    settings = {"env": "FetchPush-v1", "epochs": 1, "cycles": 1, "batch_size": 64}
+    settings = {"env": "FetchPush-v1", "epochs": 1, "cycles": 1, "batch_size": 64, "trunk_rate": 1}
     train(Config(**settings, eval_episodes=16, num_workers=1, out=str(tmp_path)))
     plasticity.main([str(tmp_path)])
     line = capsys.readouterr().out.splitlines()[-1].split(" | ")
