@@ -186,9 +186,12 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
     over seeds), the mean success over the epochs that all runs of the environment have, and over
     the last ones of each run, with 95 % intervals. For each method that shares more than one
     environment with VCP: the interquartile mean over all of the second for both, on the shared
-    ones, with a bootstrap that draws seeds within each environment."""
+    ones, with a bootstrap that draws seeds within each environment. Runs that were stopped before
+    their last epoch are left out."""
     success = defaultdict(lambda: defaultdict(list))
     for run in runs:
+        if len(run.rows["epoch"]) < run.config.epochs:
+            continue
         key = run.config.env + schedule(run.config).replace("\n", ", ")
         success[key][label(run.config)].append(run.rows["test_success_rate"])
     lines, means = [], defaultdict(dict)

@@ -23,9 +23,10 @@ from vcp import value_consistency_priority
 SMALL = "epochs=2,cycles=1,updates=1,batch_size=16,eval_episodes=16"
 
 
-def make_run(folder, epochs=6, level=1.0, **settings):
-    """A run's files, in which the success rises by `level` to 1 at most."""
-    config = options.complete(Config(**settings))
+def make_run(folder, epochs=6, level=1.0, of=None, **settings):
+    """A run's files, in which the success rises by `level` to 1 at most. of: all its epochs, for a
+    run that was stopped before."""
+    config = options.complete(Config(**settings, epochs=of or epochs or 1))
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps({"config": asdict(config)}))
     with open(folder / "progress.csv", "w", newline="") as file:
@@ -56,6 +57,7 @@ def results(tmp_path):
                 make_run(folder, epochs=6 + seed, env=env, seed=seed, **settings)
     make_run(tmp_path / "small", env="FetchReach-v1", updates=2)
     make_run(tmp_path / "just-begun", epochs=0, env="FetchReach-v1")
+    make_run(tmp_path / "stopped", epochs=2, of=6, env="Reacher-v2", trunk_rate=0.5)
     return tmp_path
 
 
@@ -215,6 +217,7 @@ def test_the_summary(results):
     assert vcp[2:5] == ["2", "6", "5"]
     assert vcp[5].startswith("0.670 (0.667-0.673)") and vcp[6].startswith("0.822 (0.760-0.884)")
     # .35 and .36 twice, beside .667 and .673 twice; the schedule that only VCP has does not count
+    assert not [r for r in rows if "trunk_rate" in str(r)]  # stopped
     (total,) = [r for r in rows if r[0] == "| VCP, 4 heads" and len(r) == 4]
     assert total[1] == "FetchReach-v1, Reacher-v2"
     assert total[2].startswith("0.355 (0.35") and total[3].startswith("0.670 (0.66")
