@@ -5,6 +5,7 @@ run is follows from its settings, whatever its folder is called.
 """
 
 import argparse
+import math
 import re
 import sys
 from collections import defaultdict
@@ -186,8 +187,8 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
     over seeds), the mean success over the epochs that all runs of the environment have, and over
     the last ones of each run, with 95 % intervals. For each method that shares more than one
     environment with VCP: the interquartile mean over all of the second for both, on the shared
-    ones, with a bootstrap that draws seeds within each environment. Runs that were stopped before
-    their last epoch are left out."""
+    ones, each of the same weight, with a bootstrap that draws seeds within each. Runs that
+    were stopped before their last epoch are left out."""
     success = defaultdict(lambda: defaultdict(list))
     for run in runs:
         if len(run.rows["epoch"]) < run.config.epochs:
@@ -210,13 +211,15 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
             lines.append(f"| {env} | {name} | {' | '.join(columns)} |")
 
     def total(scores: list[np.ndarray]) -> str:
+        seeds = math.lcm(*map(len, scores))  # so that each environment counts the same
+
+        def middle(scores):
+            return interquartile_mean(np.stack([np.repeat(x, seeds // len(x)) for x in scores]))
+
         rng = np.random.default_rng(0)
-        drawn = [
-            interquartile_mean(np.concatenate([rng.choice(x, len(x)) for x in scores]))
-            for _ in range(draws)
-        ]
+        drawn = [middle([rng.choice(x, len(x)) for x in scores]) for _ in range(draws)]
         low, high = np.quantile(drawn, [0.025, 0.975])
-        return f"{interquartile_mean(np.concatenate(scores)):.3f} ({low:.3f}-{high:.3f})"
+        return f"{middle(scores):.3f} ({low:.3f}-{high:.3f})"
 
     totals = []
     for name, by_env in sorted(means.items()):

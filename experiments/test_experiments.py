@@ -224,6 +224,18 @@ def test_the_summary(results):
     assert not [r for r in rows if r[0] == "| VCP"]
 
 
+def test_the_summary_gives_each_environment_the_same_weight(tmp_path):
+    """One environment at 0 with one seed and one at 1 with three: the middle half is half of each,
+    not the .75 of all runs together."""
+    for method in ("vcp", "her"):
+        make_run(tmp_path / method / "a", level=0, env="FetchReach-v1", method=method)
+        for seed in range(3):
+            folder = tmp_path / method / f"b{seed}"
+            make_run(folder, level=5, env="Reacher-v2", method=method, seed=seed)
+    last = figures.draw("summary", tmp_path).read_text().splitlines()[-1]
+    assert last.split(" | ")[2:] == ["0.500 (0.500-0.500)", "0.500 (0.500-0.500) |"]
+
+
 def test_smoothing_and_statistics_by_hand():
     x = np.array([[0.0, 1, 1]])
     np.testing.assert_array_equal(figures.smoothed(x, 0), x)
