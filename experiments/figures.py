@@ -187,8 +187,8 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
     over seeds), the mean success over the epochs that all runs of the environment have, and over
     the last ones of each run, with 95 % intervals. For each method that shares more than one
     environment with VCP: the interquartile mean over all of the second for both, on the shared
-    ones, each of the same weight, with a bootstrap that draws seeds within each. Runs that
-    were stopped before their last epoch are left out."""
+    ones, each of the same weight, with a bootstrap that draws seeds within each. Runs that were
+    stopped before their last epoch are left out."""
     success = defaultdict(lambda: defaultdict(list))
     for run in runs:
         if len(run.rows["epoch"]) < run.config.epochs:

@@ -216,8 +216,8 @@ def test_the_summary(results):
     # success .2 .4 .6 .8 1 1 and .21 .41 .61 .81 1 1 1, six epochs that both have
     assert vcp[2:5] == ["2", "6", "5"]
     assert vcp[5].startswith("0.670 (0.667-0.673)") and vcp[6].startswith("0.822 (0.760-0.884)")
-    # .35 and .36 twice, beside .667 and .673 twice; the schedule that only VCP has does not count
     assert not [r for r in rows if "trunk_rate" in str(r)]  # stopped
+    # .35 and .36 twice, beside .667 and .673 twice; the schedule that only VCP has does not count
     (total,) = [r for r in rows if r[0] == "| VCP, 4 heads" and len(r) == 4]
     assert total[1] == "FetchReach-v1, Reacher-v2"
     assert total[2].startswith("0.355 (0.35") and total[3].startswith("0.670 (0.66")
@@ -226,7 +226,7 @@ def test_the_summary(results):
 
 def test_the_summary_gives_each_environment_the_same_weight(tmp_path):
     """One environment at 0 with one seed and one at 1 with three: the middle half is half of each,
-    not the .75 of all runs together."""
+    not the 1 of all runs together."""
     for method in ("vcp", "her"):
         make_run(tmp_path / method / "a", level=0, env="FetchReach-v1", method=method)
         for seed in range(3):
