@@ -13,11 +13,11 @@ import numpy as np
 import options
 import records
 import run
-from envs_point import UsageError, make_env
+from envs_point import UsageError
+from experiments.checkpoints import restored
 from experiments.effective import effective_share
 from experiments.figures import RESULTS
 from experiments.variance_figures import STAGES
-from her import EpisodeBuffer
 from options import Config
 from workers import ParallelEnvs
 
@@ -38,14 +38,8 @@ def trained(config: Config, epoch: int):
         raise UsageError(f"{folder} has {done} epochs, not {epoch}: remove it or choose an --out")
     if done < epoch:
         run.train(config, resume=(folder / "config.json").exists())
-    env = make_env(config.env)
-    agent = run.make_agent(config, env)
-    original = EpisodeBuffer(config.buffer_size, 50, 2, 2, 2)
-    her_buffer = run.make_replay(config, env, original, None)
-    states = records.load_checkpoint(folder)["parts"]
-    for part, state in zip((agent, original, her_buffer), states, strict=True):
-        part.load_state_dict(state)
-    return agent, original, her_buffer
+    its = restored(folder)
+    return its.agent, its.original, its.replay
 
 
 def figure_3(config: Config) -> dict[str, np.ndarray]:

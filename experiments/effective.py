@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-import options
-import records
 from envs_point import UsageError
+from experiments.checkpoints import restored
 from vcp import value_consistency_priority
 
 TEMPERATURES = (1, 5, 9, 11, 15)  # Appendix B
@@ -28,14 +27,14 @@ def main(folders: list[str]) -> None:
     print(f"| run | epoch | {' | '.join(f'𝒯 = {t}' for t in TEMPERATURES)} |")
     print(f"|---|---|{'---|' * len(TEMPERATURES)}")
     for folder in map(Path, folders):
-        config, saved = options.load(folder), records.load_checkpoint(folder)
-        if saved is None or config.method != "vcp":
-            raise UsageError(f"{folder} holds no run of VCP with a whole epoch")
-        variance = saved["parts"][2]["rows"]["variance"].numpy()
+        its = restored(folder)
+        if its.config.method != "vcp":
+            raise UsageError(f"{folder} holds no run of VCP")
+        variance = its.replay.data["variance"][: its.replay.size]
         priorities = [value_consistency_priority(variance, t) for t in TEMPERATURES]
         shares = [f"{effective_share(p):.1%}" for p in priorities]
-        epoch = len(saved["rows"])
-        print(f"| {config.env}, {config.priority} priority | {epoch} | {' | '.join(shares)} |")
+        name = f"{its.config.env}, {its.config.priority} priority"
+        print(f"| {name} | {its.epoch} | {' | '.join(shares)} |")
 
 
 if __name__ == "__main__":

@@ -11,12 +11,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import options
-import records
 from ensemble import MultiHeadMLP, linear
-from envs_point import UsageError, make_env
+from envs_point import UsageError
+from experiments.checkpoints import restored
 from experiments.figures import label
-from run import make_agent
 
 
 @torch.no_grad()
@@ -38,21 +36,15 @@ def main(folders: list[str]) -> None:
     print("| run | epoch | dead: actor's trunk | actors' heads | critic's trunk | critics' heads |")
     print("|---|---|---|---|---|---|")
     for folder in map(Path, folders):
-        config, saved = options.load(folder), records.load_checkpoint(folder)
-        if saved is None:
-            raise UsageError(f"{folder} holds no run with a whole epoch")
-        env = make_env(config.env)
-        agent = make_agent(config, env)
-        env.close()
-        agent.load_state_dict(saved["parts"][0])
-        episodes = {name: x.numpy() for name, x in saved["parts"][1].items()}
+        its = restored(folder)
+        agent, episodes = its.agent, its.original.episodes
         rng = np.random.default_rng(0)
         e, t = (rng.integers(n, size=4096) for n in episodes["action"].shape[:2])
         state = agent._state(episodes["obs"][e, t], episodes["desired_goal"][e])
         action = agent._tensor(episodes["action"][e, t])
         layers = hidden(agent.actor, state) + hidden(agent.critic, torch.cat([state, action], 1))
         shares = " | ".join(f"{dead_share(units):.0%}" for units in layers)
-        print(f"| {config.env}, {label(config)} | {len(saved['rows'])} | {shares} |")
+        print(f"| {its.config.env}, {label(its.config)} | {its.epoch} | {shares} |")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,8 @@ import importlib.util
 import json
 import sys
 from dataclasses import asdict
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,9 +14,18 @@ import torch
 
 import options
 from ensemble import MultiHeadMLP, linear
-from envs_point import UsageError
-from experiments import didactic, effective, figures, plasticity, sweep, variance_figures
-from options import Config
+from envs_point import UsageError, make_env
+from experiments import (
+    didactic,
+    effective,
+    figures,
+    plasticity,
+    replayed,
+    sweep,
+    variance_figures,
+)
+from her import EpisodeBuffer
+from options import METHODS, Config
 from records import COLUMNS, epochs_done
 from run import train
 from test_vcp import without_timing
@@ -171,6 +182,41 @@ def test_the_effective_sample_size(tmp_path, capsys):
     line = capsys.readouterr().out.splitlines()[-1].split(" | ")
     shares = [float(x.rstrip("% |")) for x in line[2:]]
     assert line[1] == "2" and len(shares) == 5 and shares == sorted(shares, reverse=True)
+
+
+def test_what_each_method_replays(tmp_path, capsys):
+    """Half of the episodes stand still; in the others each step leads out of the threshold, so that
+    r = 0 for t' = t + 1 alone, on average over t for H_T / T of the hindsight."""
+    horizon = 50
+    ahead = 1 - np.sum(1 / np.arange(1, horizon + 1)) / horizon
+    original = EpisodeBuffer(10_000, horizon, 2, 2, 2)
+    xy = np.zeros((200, horizon + 1, 2))
+    xy[100:] = np.arange(horizon + 1)[:, None]
+    episodes = {"obs": xy, "achieved_goal": xy, "desired_goal": xy[:, 0] - 1}
+    original.add({**episodes, "action": np.zeros((200, horizon, 2))}, np.random.default_rng(0))
+    env = make_env("PointMassEmptyEnv-v1")
+    reward_fn = partial(env.unwrapped.compute_reward, info={})
+
+    def far(obs, action, goal):  # of the variance 1, what is near of 0
+        return (np.linalg.norm(obs - goal, axis=1) > 2).astype(float)
+
+    config, agent = Config(env="PointMassEmptyEnv-v1"), SimpleNamespace(q_variance=far)
+    its = SimpleNamespace(config=config, env=env, reward_fn=reward_fn, agent=agent)
+    its.original = original
+    share = {m: replayed.share_ahead(its, m, np.random.default_rng(0)) for m in METHODS}
+    assert share["her"] == pytest.approx(ahead / 2, abs=0.02)
+    assert share["herebp"] == pytest.approx(ahead, abs=0.02)
+    assert share["vcp"] == 0  # nothing far is drawn
+    its.config = Config(env=config.env, heads=1)
+    assert np.isnan(replayed.share_ahead(its, "vcp", np.random.default_rng(0)))
+
+    sweep.main(arguments(tmp_path, "--task", "0"))
+    replayed.main([str(tmp_path / "PointMassEmptyEnv-v1" / "vcp" / "seed0")])
+    line = capsys.readouterr().out.splitlines()[-1].split(" | ")
+    assert line[1] == "2" and all(0 < float(x.rstrip("% |")) < 100 for x in line[2:])
+    with pytest.raises(UsageError, match="no run with a whole epoch"):
+        make_run(tmp_path / "begun", epochs=0)
+        replayed.main([str(tmp_path / "begun")])
 
 
 def test_dead_units(tmp_path, capsys):
