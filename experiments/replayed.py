@@ -19,17 +19,19 @@ from experiments.figures import label
 from options import METHODS, Config
 from vcp import update_her_buffer
 
-BATCHES = 80  # mini-batches that are looked at
+BATCHES = 160  # mini-batches that are looked at
 SCORED = 4096  # transitions at once, by Algorithm 1
 
 
 def share_ahead(its, method: str, rng: np.random.Generator) -> float:
     """The share of r = -1 among the hindsight transitions that `method` draws from B_o, with the
-    paper's schedule. its: what `restored` gives. NaN for VCP with the critic of one network."""
+    batch and the B_h of Appendix B's larger tasks. its: what `restored` gives. NaN for VCP with the
+    critic of one network."""
     heads, ratio = its.config.heads, its.config.relabel_ratio
     if method == "vcp" and heads == 1:
         return math.nan
-    config = Config(env=its.config.env, method=method, heads=heads, relabel_ratio=ratio)
+    schedule = options.paper_schedule("FetchPush-v1", method)
+    config = Config(its.config.env, method, heads=heads, relabel_ratio=ratio, **schedule)
     config = options.complete(config)
     replay = run.make_replay(config, its.env, its.original, its.reward_fn)
     if method == "vcp":
