@@ -24,9 +24,10 @@ from experiments import (
     sweep,
     variance_figures,
 )
+from experiments.checkpoints import restored
 from her import EpisodeBuffer
 from options import METHODS, Config
-from records import COLUMNS, epochs_done
+from records import COLUMNS, epochs_done, load_checkpoint
 from run import train
 from test_vcp import without_timing
 from vcp import value_consistency_priority
@@ -211,7 +212,11 @@ def test_what_each_method_replays(tmp_path, capsys):
     assert np.isnan(replayed.share_ahead(its, "vcp", np.random.default_rng(0)))
 
     sweep.main(arguments(tmp_path, "--task", "0"))
-    replayed.main([str(tmp_path / "PointMassEmptyEnv-v1" / "vcp" / "seed0")])
+    folder = tmp_path / "PointMassEmptyEnv-v1" / "vcp" / "seed0"
+    whole, saved = restored(folder), load_checkpoint(folder)["parts"]
+    for part, state in zip((whole.agent, whole.original, whole.replay), saved, strict=True):
+        torch.testing.assert_close(part.state_dict(), state, rtol=0, atol=0)
+    replayed.main([str(folder)])
     line = capsys.readouterr().out.splitlines()[-1].split(" | ")
     assert line[1] == "2" and all(0 < float(x.rstrip("% |")) < 100 for x in line[2:])
     with pytest.raises(UsageError, match="no run with a whole epoch"):
