@@ -8,6 +8,7 @@ their goal, in a task with an object mostly because nothing has touched it.
 import math
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -23,7 +24,7 @@ BATCHES = 160  # mini-batches that are looked at
 SCORED = 4096  # transitions at once, by Algorithm 1
 
 
-def share_ahead(its, method: str, rng: np.random.Generator) -> float:
+def share_ahead(its: SimpleNamespace, method: str, rng: np.random.Generator) -> float:
     """The share of r = -1 among the hindsight transitions that `method` draws from B_o, with the
     batch and the B_h of Appendix B's larger tasks. its: what `restored` gives. NaN for VCP with the
     critic of one network."""
@@ -32,12 +33,10 @@ def share_ahead(its, method: str, rng: np.random.Generator) -> float:
         return math.nan
     schedule = options.paper_schedule("FetchPush-v1", method)
     config = Config(its.config.env, method, heads=heads, relabel_ratio=ratio, **schedule)
-    config = options.complete(config)
     replay = run.make_replay(config, its.env, its.original, its.reward_fn)
     if method == "vcp":
-        size = min(SCORED, replay.capacity)
-        for _ in range(replay.capacity // size):
-            update_her_buffer(its.original, replay, its.agent, size, rng, ratio, its.reward_fn)
+        for _ in range(replay.capacity // SCORED):
+            update_her_buffer(its.original, replay, its.agent, SCORED, rng, ratio, its.reward_fn)
     else:
         replay.new_episodes(np.arange(its.original.size))
     drawn = [replay.sample(config.batch_size, rng) for _ in range(BATCHES)]
