@@ -74,12 +74,14 @@ def read_config(folder: Path) -> dict:
 
 def start(folder: Path, config: dict, rows: list[dict], resume: bool) -> None:
     """Make the run's folder, or with `resume` bring it to the state of the rows of its checkpoint.
-    UsageError if it holds a run that is not resumed, or cannot be written to."""
+    A finished run's config.json keeps the commit and versions that made it. UsageError if the
+    folder holds a run that is not resumed, or cannot be written to."""
     if not resume and (folder / "config.json").exists():
         raise UsageError(f"{folder} already holds a run: --resume it, or choose another --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_config(folder, config)
+        if len(rows) < config["epochs"]:
+            write_config(folder, config)
         write_rows(folder, rows)
     except OSError as error:
         raise UsageError(f"cannot write to {folder}: {error.strerror}") from error

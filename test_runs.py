@@ -141,8 +141,11 @@ def test_resuming_from_the_command_line(whole, tmp_path, capsys):
         assert stop.value.code == 2 and "the run was made with" in capsys.readouterr().err
     run.main([f"--resume={folder}", "--epochs=4", "--temperature=9"])
     assert_same_run(whole, folder)
+    about = (folder / "config.json").read_text().replace('"commit": ', '"commit": "older", "was": ')
+    (folder / "config.json").write_text(about)
     run.main([f"--resume={folder}"])  # nothing is left to do
     assert_same_run(whole, folder)
+    assert (folder / "config.json").read_text() == about
 
 
 @pytest.mark.slow
