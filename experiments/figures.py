@@ -183,18 +183,21 @@ def interquartile_mean(x: np.ndarray) -> float:
 
 
 def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
-    """Two tables. For each environment and method: the first epoch with a success of 0.95 (median
-    over seeds), the mean success over the epochs that all runs of the environment have, and over
-    the last ones of each run, with 95 % intervals. For each method that shares more than one
-    environment with VCP: the interquartile mean over all of the second for both, on the shared
-    ones, each of the same weight, with a bootstrap that draws seeds within each. Runs that were
-    stopped before their last epoch are left out."""
+    """Two tables. For each environment and method: the first epoch with a success of 0.95 and the
+    minutes an epoch took (medians over seeds), the mean success over the epochs that all runs of
+    the environment have, and over the last ones of each run, with 95 % intervals. For each method
+    that shares more than one environment with VCP: the interquartile mean over all of the second
+    for both, on the shared ones, each of the same weight, with a bootstrap that draws seeds within
+    each. Runs that were stopped before their last epoch are left out."""
     success = defaultdict(lambda: defaultdict(list))
+    minutes = defaultdict(list)
     for run in runs:
-        if len(run.rows["epoch"]) < run.config.epochs:
+        epochs = len(run.rows["epoch"])
+        if epochs < run.config.epochs:
             continue
         key = run.config.env + schedule(run.config).replace("\n", ", ")
         success[key][label(run.config)].append(run.rows["test_success_rate"])
+        minutes[key, label(run.config)].append(run.rows["wall_seconds"][-1] / epochs / 60)
     lines, means = [], defaultdict(dict)
     for env, methods in sorted(success.items()):
         epochs = min(len(curve) for seeds in methods.values() for curve in seeds)
@@ -208,6 +211,7 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
                 columns.append(f"{x.mean():.3f}")
                 if len(seeds) > 1:
                     columns[-1] += " ({:.3f}-{:.3f})".format(*interval(x))
+            columns.append(f"{np.median(minutes[env, name]):.2f}")
             lines.append(f"| {env} | {name} | {' | '.join(columns)} |")
 
     def total(scores: list[np.ndarray]) -> str:
@@ -227,8 +231,9 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
         if name != "VCP" and len(shared) > 1:
             both = (total([means[n][env] for env in shared]) for n in (name, "VCP"))
             totals.append(f"| {name} | {', '.join(shared)} | {' | '.join(both)} |")
-    head = [f"| environment | method | seeds | epochs | first at .95 | mean | last {last} |"]
-    tables = [*head, "|---|---|---|---|---|---|---|", *lines]
+    columns = ("seeds", "epochs", "first at .95", "mean", f"last {last}", "minutes an epoch")
+    head = [f"| environment | method | {' | '.join(columns)} |", "|---" * (2 + len(columns)) + "|"]
+    tables = [*head, *lines]
     if totals:
         tables += ["", "| method | environments | interquartile mean of the mean | VCP's |"]
         tables += ["|---|---|---|---|"]

@@ -45,7 +45,7 @@ def make_run(folder, epochs=6, level=1.0, of=None, **settings):
         table = csv.writer(file)
         table.writerow(COLUMNS)
         for epoch in range(1, epochs + 1):
-            row = dict.fromkeys(COLUMNS, 0.5) | {"epoch": epoch}
+            row = dict.fromkeys(COLUMNS, 0.5) | {"epoch": epoch, "wall_seconds": 90 * epoch}
             row["test_success_rate"] = min(1, level * epoch / 5 + 0.01 * config.seed)
             table.writerow(row.values())
 
@@ -267,6 +267,7 @@ def test_the_summary(results):
     # success .2 .4 .6 .8 1 1 and .21 .41 .61 .81 1 1 1, six epochs that both have
     assert vcp[2:5] == ["2", "6", "5"]
     assert vcp[5].startswith("0.670 (0.667-0.673)") and vcp[6].startswith("0.822 (0.760-0.884)")
+    assert vcp[7] == "1.50 |"  # minutes an epoch
     assert not [r for r in rows if "trunk_rate" in str(r)]  # stopped
     # .35 and .36 twice, beside .667 and .673 twice; the schedule that only VCP has does not count
     (total,) = [r for r in rows if r[0] == "| VCP, 4 heads" and len(r) == 4]
