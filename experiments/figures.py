@@ -9,7 +9,7 @@ import math
 import re
 import sys
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +57,11 @@ def as_many_updates(c: Config) -> bool:
     return c.heads == 1 and same
 
 
+# by the panel's title, in words by the label, or nowhere, as it changes nothing
+SAID_ELSEWHERE = ("env", "cycles", "updates", "batch_size", "seed", "eval_episodes")
+SAID_ELSEWHERE += ("method", "heads", "priority", "acting_head", *options.MAY_CHANGE)
+
+
 def label(c: Config) -> str:
     """What the legend calls the run: its method and what is not the paper's default."""
     parts = [c.method.upper()]
@@ -68,9 +73,10 @@ def label(c: Config) -> str:
         parts.append(f"{c.priority} priority")
     if c.acting_head == "one":
         parts.append("one acting head")
-    default = replace(Config(), trunk_rate=options.trunk_rate(c.updates, c.heads))
-    others = ("temperature", "importance", "relabel_ratio", "buffer_size", "trunk_rate")
-    for name in (*others, "her_thread", "faithful"):
+    scored = options.paper_schedule(c.env, c.method)["scored_per_update"]
+    rate = options.trunk_rate(c.updates, c.heads)
+    default = Config(scored_per_update=scored, trunk_rate=rate)
+    for name in (f.name for f in fields(Config) if f.name not in SAID_ELSEWHERE):
         if getattr(c, name) != getattr(default, name):
             parts.append(f"{name} {getattr(c, name)}")
     return ", ".join(parts)
