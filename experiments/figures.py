@@ -57,7 +57,8 @@ def as_many_updates(c: Config) -> bool:
     return c.heads == 1 and same
 
 
-# by the panel's title, in words by the label, or nowhere, as it changes nothing
+# Settings that the panel's title or the label's own words say, or that need no saying, as the
+# training does not depend on them or all seeds are one line.
 SAID_ELSEWHERE = ("env", "cycles", "updates", "batch_size", "seed", "eval_episodes")
 SAID_ELSEWHERE += ("method", "heads", "priority", "acting_head", *options.MAY_CHANGE)
 

@@ -113,6 +113,7 @@ def test_each_figure_has_its_runs(name, lines, results, monkeypatch):
     [
         ({"temperature": 1.0}, "VCP, temperature 1.0"),
         ({"buffer_size": 10_000}, "VCP, buffer_size 10000"),
+        ({"scored_per_update": 1}, "VCP, scored_per_update 1"),
         ({"action_penalty": 0.1, "noise": 0.1}, "VCP, noise 0.1, action_penalty 0.1"),
         ({"env": "FetchPush-v1"}, "VCP"),
         ({"env": "FetchPush-v1", "trunk_rate": 1.0}, "VCP, trunk_rate 1.0"),
