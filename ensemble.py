@@ -8,6 +8,10 @@ Nothing here knows about priorities: a mini-batch comes in with a weight for eac
 the variance of the Q-values goes out. The prioritisation is in vcp.py.
 """
 
+import copy
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import torch
 
@@ -146,6 +150,7 @@ class EnsembleDDPG:
         self.actor, self.critic = actor(), critic()
         self.target_actor, self.target_critic = actor(), critic()
         self._move_targets(trunk_step=1.0, head_step=1.0)  # targets start as copies
+        self._frozen_critic = copy.deepcopy(self.critic)
         self.normalizer = Normalizer(state, device)
 
         # One Adam for everything; it passes over the heads that are not updated, which have no
@@ -174,12 +179,23 @@ class EnsembleDDPG:
         q = self.critic.forward_heads(torch.cat([state, self.actor.forward_heads(state)], -1))
         return q.squeeze(-1).cpu().numpy()
 
-    @torch.no_grad()
     def q_variance(self, obs: np.ndarray, action: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Section 4.2: σ² over the K critics of Q_k(s, a, g), the variance that Eq. (4) turns into
         a priority: the biased one, 1/K Σ_k (Q_k - mean)². (B, O), (B, A), (B, G) -> (B,)."""
+        return self._q_variance(self.critic, obs, action, goal)
+
+    @torch.no_grad()
+    def frozen_q_variance(self) -> Callable[..., np.ndarray]:
+        """`q_variance` with the critics as they stand now: a copy of them, which another thread
+        can use while `update_head` changes the originals. It holds until the next call."""
+        here, frozen = self.critic, self._frozen_critic
+        torch._foreach_copy_(frozen.trunk + frozen.heads, here.trunk + here.heads)
+        return partial(self._q_variance, frozen)
+
+    @torch.no_grad()
+    def _q_variance(self, critic: MultiHeadMLP, obs, action, goal) -> np.ndarray:
         state_action = torch.cat([self._state(obs, goal), self._tensor(action)], -1)
-        q = self.critic.forward_heads(state_action).squeeze(-1)  # (K, B)
+        q = critic.forward_heads(state_action).squeeze(-1)  # (K, B)
         return q.var(dim=0, correction=0).cpu().numpy()
 
     # ---------------------------------------------------------------- learning

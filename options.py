@@ -43,7 +43,7 @@ class Config:
     priority: str = option("consistency", "Eq. (4), or an ablation of Section 5.6", [*PRIORITIES])
     importance: str = option("paper", "w_i: Section 4.3, Schaul et al., or 1", [*IMPORTANCE])
     acting_head: str = option("all", "the heads that collect, Section 5.6", ["all", "one"])
-    her_thread: bool = option(False, "Algorithm 1 in a thread, as in the paper; not reproducible")
+    scored_per_drawn: float = option(1.0, "transitions Algorithm 1 scores for each one drawn")
     # The methods it is compared with
     faithful: bool = option(False, "herebp, cher, dtgsh with their released code's flaws: NOTES.md")
     # The machine
@@ -52,7 +52,7 @@ class Config:
     tensorboard: bool = option(False, "write the rows for TensorBoard too (needs tensorboard)")
     # HER and DDPG
     relabel_ratio: float = 0.8
-    scored_per_update: int | None = None  # mini-batches through Algorithm 1 for one of all heads
+    her_buffer_capacity: int | None = None  # of B_h, in transitions; None: what a cycle draws
     buffer_size: int = 1_000_000  # of B_o, in transitions
     learning_rate: float = 1e-3
     trunk_rate: float | None = None  # the shared trunks' share; None: `trunk_rate` below
@@ -62,22 +62,27 @@ class Config:
     action_penalty: float = 1.0
 
 
-OF_VCP = ("temperature", "priority", "importance", "her_thread")  # of no other method
+OF_VCP = (
+    "temperature",
+    "priority",
+    "importance",
+    "scored_per_drawn",
+    "her_buffer_capacity",
+)  # of no other method
 MAY_CHANGE = ("epochs", "out", "device", "num_workers", "tensorboard")  # when a run is resumed
 
 
 def paper_schedule(env: str, method: str = "vcp") -> dict[str, int]:
-    """Appendix B's n and batch size. Not in the paper: the number of updates, and how many
-    mini-batches Algorithm 1 scores for one update of all heads."""
+    """Appendix B's n and batch size. Not in the paper: the number of updates."""
     if method == "dtgsh":  # Appendix B: batch 64 everywhere, and as many transitions as the others
         schedule = paper_schedule(env)
         updates = schedule["updates"] * schedule["batch_size"] // 64
         return {**schedule, "batch_size": 64, "updates": updates}
     if env.startswith("FetchReach"):
-        return {"cycles": 5, "updates": 5, "batch_size": 64, "scored_per_update": 4}
+        return {"cycles": 5, "updates": 5, "batch_size": 64}
     if env.startswith(("Reacher", "SparseReacher")):
-        return {"cycles": 15, "updates": 5, "batch_size": 64, "scored_per_update": 4}
-    return {"cycles": 50, "updates": 40, "batch_size": 256, "scored_per_update": 1}
+        return {"cycles": 15, "updates": 5, "batch_size": 64}
+    return {"cycles": 50, "updates": 40, "batch_size": 256}
 
 
 def trunk_rate(updates: int, heads: int) -> float:
@@ -85,6 +90,19 @@ def trunk_rate(updates: int, heads: int) -> float:
     updates a cycle, 1, Algorithm 2 to the letter: the trunks take K whole steps, one with each
     head. With many these K steps add up to one (NOTES.md, "The trunk's step")."""
     return 1.0 if updates <= 5 else 1 / heads
+
+
+def her_buffer_capacity(config: Config) -> int:
+    """Transitions that B_h holds, where none are given what a cycle draws (not in the paper; the
+    released code's). UsageError if what Algorithm 1 scores at once is nothing or does not fit."""
+    drawn, rate = config.batch_size * config.heads, config.scored_per_drawn  # by a sweep
+    if not 1 / drawn <= rate < math.inf:
+        raise UsageError(f"--scored-per-drawn must be {1 / drawn:g} or more here, not {rate}")
+    scored = round(rate * drawn)
+    capacity = config.her_buffer_capacity or max(drawn * config.updates, scored)
+    if scored > capacity:
+        raise UsageError(f"{scored} transitions are scored at once, and B_h holds {capacity}")
+    return capacity
 
 
 def complete(config: Config) -> Config:
@@ -108,6 +126,8 @@ def complete(config: Config) -> Config:
         raise UsageError(f"--seed must be 0 or more, not {config.seed}")
     if not math.isfinite(config.temperature):
         raise UsageError(f"--temperature must be a finite number, not {config.temperature}")
+    if config.method == "vcp":
+        config.her_buffer_capacity = her_buffer_capacity(config)
     if config.trunk_rate is None:
         config.trunk_rate = trunk_rate(config.updates, config.heads)
     if config.device == "auto":

@@ -10,7 +10,8 @@ import math
 import sys
 import time
 from collections import defaultdict
-from contextlib import contextmanager, nullcontext
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -26,8 +27,8 @@ from envs_point import UsageError, describe, make_env
 from her import EpisodeBuffer, HERReplay, relabel_future
 from options import Config
 from rollout import actor, evaluate, explorer, rollout
-from vcp import HERBuffer, in_thread, update_her_buffer
-from workers import ParallelEnvs, fast_products, without_denormals
+from vcp import HERBuffer, score, update_her_buffer
+from workers import ParallelEnvs, fast_products, one_thread, without_denormals
 
 tqdm.monitor_interval = 0  # its watching thread would outlive a run
 
@@ -75,8 +76,7 @@ def make_replay(config: Config, env: gym.Env, original_buffer: EpisodeBuffer, re
     drawn = config.updates * config.heads  # mini-batches in a cycle
     if config.method == "vcp":
         return HERBuffer(
-            # what a cycle draws, and no less than Algorithm 1 stores at once
-            capacity=config.batch_size * max(drawn, config.scored_per_update),
+            capacity=config.her_buffer_capacity,
             temperature=config.temperature,
             priority=config.priority,
             importance=config.importance,
@@ -95,6 +95,7 @@ def make_replay(config: Config, env: gym.Env, original_buffer: EpisodeBuffer, re
     return dtgsh.DTGSH(*her, **common)
 
 
+@one_thread()
 @without_denormals()
 def train(config: Config, resume: bool = False) -> list[dict]:
     """Algorithm 2. Writes the run's folder and gives the rows of its progress.csv.
@@ -140,10 +141,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
         agent.normalizer.update(np.concatenate([seen["obs"], seen["goal"]], axis=1))
         return success
 
-    def algorithm_1():  # its lines 3-7
-        size = batch_size * config.scored_per_update
-        ratio = config.relabel_ratio
-        update_her_buffer(original_buffer, her_buffer, agent, size, her_rng, ratio, reward_fn)
+    scored = round(config.scored_per_drawn * heads * batch_size)  # by Algorithm 1, a sweep
 
     rows, env_steps, start = [], 0, time.perf_counter()
     parts = (agent, original_buffer, her_buffer)
@@ -154,7 +152,11 @@ def train(config: Config, resume: bool = False) -> list[dict]:
         rows = saved["rows"]
         env_steps, start = rows[-1]["env_steps"], start - rows[-1]["wall_seconds"]
 
-    with ParallelEnvs(config.env, num_envs, config.num_workers, heads) as envs, fast_products():
+    with (
+        ParallelEnvs(config.env, num_envs, config.num_workers, heads) as envs,
+        ThreadPoolExecutor(1) as thread,
+        fast_products(),
+    ):
         records.start(folder, asdict(config), rows, resume)
         print(describe(config.env))
         for epoch in range(len(rows) + 1, config.epochs + 1):  # line 2
@@ -174,14 +176,22 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                     successes.append(collect(config.random_actions))
                     env_steps += num_envs * horizon
                 with timed(seconds, "train"):  # line 12, Training
-                    with in_thread(algorithm_1) if config.her_thread else nullcontext():
-                        for _ in range(config.updates):
-                            if vcp and not config.her_thread:
-                                algorithm_1()  # line 13, at a fixed rate
-                            for k in range(heads):  # line 14
-                                batch = her_buffer.sample(batch_size, draw_rng)  # line 15
-                                losses.append(agent.update_head(k, batch))  # line 16
-                                originals.append(1 - batch["hindsight"].mean())
+                    relabelling = (her_rng, config.relabel_ratio, reward_fn)
+                    if vcp and not her_buffer.size:  # something to draw, once, of all there is
+                        first = min(original_buffer.size * horizon, her_buffer.capacity)
+                        its = (original_buffer, her_buffer, agent.q_variance)
+                        update_her_buffer(*its, first, *relabelling)
+                    for _ in range(config.updates):
+                        if vcp:  # line 13: Algorithm 1, its lines 3-5, in another thread
+                            its = (original_buffer, agent.frozen_q_variance())
+                            scoring = thread.submit(score, *its, scored, *relabelling)
+                        for k in range(heads):  # line 14
+                            batch = her_buffer.sample(batch_size, draw_rng)  # line 15
+                            losses.append(agent.update_head(k, batch))  # line 16
+                            originals.append(1 - batch["hindsight"].mean())
+                        if vcp:  # both are done: Algorithm 1, lines 6-7
+                            her_buffer.add(*scoring.result())
+                            her_buffer.update_priorities()
                     agent.update_targets()
                 bar.update()
             with timed(seconds, "eval"):

@@ -37,8 +37,8 @@ from envs_point import CLEARANCE, PAPER_ENVS, REACH, UsageError, make_env
 from her import EpisodeBuffer, relabel_future
 from records import COLUMNS, TIMING_COLUMNS, read_rows
 from run import Config, train
-from vcp import HERBuffer, in_thread, update_her_buffer, value_consistency_priority
-from workers import ParallelEnvs, fast_products, read_joints_by_index, small_calls
+from vcp import HERBuffer, score, update_her_buffer, value_consistency_priority
+from workers import ParallelEnvs, fast_products, one_thread, read_joints_by_index, small_calls
 
 SMALL = {"epochs": 1, "cycles": 2, "updates": 2, "batch_size": 32, "eval_episodes": 16}
 
@@ -176,7 +176,8 @@ def test_algorithm_1_scores_and_stores_what_it_drew():
     agent = EnsembleDDPG(2, 2, 2, gamma=0.98, heads=4)
     buffer = HERBuffer(100, temperature=9)
     for _ in range(2):
-        update_her_buffer(original, buffer, agent, 40, np.random.default_rng(1), 0.8, exact_reward)
+        how = (agent.q_variance, 40, np.random.default_rng(1), 0.8, exact_reward)
+        update_her_buffer(original, buffer, *how)
     assert buffer.size == 80
     rows = {name: x[:80] for name, x in buffer.data.items()}
     expected = agent.q_variance(rows["obs"], rows["action"], rows["goal"])
@@ -184,31 +185,6 @@ def test_algorithm_1_scores_and_stores_what_it_drew():
     np.testing.assert_allclose(
         buffer.probabilities, value_consistency_priority(rows["variance"], 9), rtol=1e-12
     )
-
-
-def test_in_thread_runs_beside_the_block_and_passes_errors_on():
-    calls = []
-
-    def step():
-        calls.append(threading.current_thread())
-        time.sleep(0.001)
-
-    with in_thread(step):
-        assert len(calls) >= 1  # once before the block
-        while len(calls) < 5:
-            time.sleep(0.001)
-    count = len(calls)
-    assert threading.main_thread() not in calls[1:]
-    time.sleep(0.01)
-    assert len(calls) == count and threading.active_count() == 1
-
-    countdown = iter(range(2, -1, -1))
-
-    def fails_later():
-        1 / next(countdown)
-
-    with pytest.raises(ZeroDivisionError), in_thread(fails_later):
-        time.sleep(0.05)
 
 
 @given(
@@ -932,13 +908,15 @@ def test_fast_products_are_float32_or_left_alone(monkeypatch):
     setting, x, w = torch.backends.mkldnn.matmul, torch.randn(256, 300), torch.randn(300, 256)
     before, threads = setting.fp32_precision, torch.get_num_threads()
     torch.set_num_threads(2)
-    with pytest.raises(KeyError), fast_products():
+    with pytest.raises(KeyError), fast_products(), one_thread():
+        assert torch.get_num_threads() == 1
         assert (x @ w - x.double() @ w.double()).abs().max() < 1e-4
         inside = setting.fp32_precision
         with small_calls():
-            assert torch.get_num_threads() == 1 and setting.fp32_precision == "ieee"
-        assert torch.get_num_threads() == 2 and setting.fp32_precision == inside
+            assert setting.fp32_precision == "ieee"
+        assert setting.fp32_precision == inside
         raise KeyError
+    assert torch.get_num_threads() == 2
     torch.set_num_threads(threads)
     assert setting.fp32_precision == before
 
@@ -959,7 +937,12 @@ from ensemble import EnsembleDDPG
 def zeros():
     return (torch.full((1_000_000,), 1e-20).square() == 0).float().mean().item()
 torch.set_num_threads(2)
-EnsembleDDPG.update_targets = lambda agent: print("zeros", zeros())
+def zeros_in_threads(agent):
+    print("threads", torch.get_num_threads())
+    torch.set_num_threads(2)
+    print("zeros", zeros())
+    torch.set_num_threads(1)
+EnsembleDDPG.update_targets = zeros_in_threads
 run.train(run.Config(env="PointMassEmptyEnv-v1", out={str(tmp_path / "run")!r}, **{SMALL}))
 torch.set_num_threads(1)
 print("afterwards", zeros())
@@ -971,7 +954,7 @@ print("afterwards", zeros())
         cwd=Path(run.__file__).parent,
     )
     lines = done.stdout.splitlines()
-    assert lines.count("zeros 1.0") == SMALL["cycles"], done
+    assert lines.count("zeros 1.0") == lines.count("threads 1") == SMALL["cycles"], done
     assert lines[-1] == "afterwards 0.0"
 
 
@@ -1091,9 +1074,10 @@ def test_heads_act_in_their_own_environments():
 
 @pytest.mark.parametrize(("acting_head", "collecting"), [("all", (4, 4, 2)), ("one", (1, 16, 2))])
 def test_train_does_what_algorithm_2_says(acting_head, collecting, tmp_path, monkeypatch):
-    """The calls, in order: the heads in turn, each with a mini-batch of its own; the targets once a
-    cycle; Algorithm 1 before each round; the normaliser fed with every step."""
-    calls, agents, goals = [], [], []
+    """The calls, in order: B_h filled with as much as B_o holds; then Algorithm 1 beside the heads,
+    which are updated in turn, each with a mini-batch of its own; the targets once a cycle; the
+    normaliser fed with every step."""
+    calls, agents, goals, scores, frozen, threads = [], [], [], [], [], set()
 
     class Spy(EnsembleDDPG):
         def __init__(self, *args, **kwargs):
@@ -1113,18 +1097,51 @@ def test_train_does_what_algorithm_2_says(acting_head, collecting, tmp_path, mon
             goals.append(goal)
             return super().act(obs, goal, heads)
 
-    def spy_algorithm_1(*args):
-        calls.append("algorithm 1")
-        return update_her_buffer(*args)
+        def frozen_q_variance(self):
+            calls.append("frozen")
+            frozen.append(copy.deepcopy(self))
+            return super().frozen_q_variance()
 
+    def spy_on_the_first(original_buffer, her_buffer, q_variance, size, *args):
+        calls.append(("first", size))
+        assert size == min(original_buffer.size * 50, her_buffer.capacity)
+        return update_her_buffer(original_buffer, her_buffer, q_variance, size, *args)
+
+    def spy_score(original_buffer, q_variance, size, *args):
+        """Lines 3-5, slowed down until the heads have moved on."""
+        time.sleep(0.1)
+        threads.add(threading.current_thread())
+        batch, variance = score(original_buffer, q_variance, size, *args)
+        rows = [batch[name] for name in ("obs", "action", "goal")]
+        scores.append((variance, rows, agents[0].q_variance(*rows)))
+        return batch, variance
+
+    def spy_add(self, batch, variance):
+        if len(variance) == 128:
+            calls.append("stored")
+        return add(self, batch, variance)
+
+    add = HERBuffer.add
+    monkeypatch.setattr(HERBuffer, "add", spy_add)
     monkeypatch.setattr(run, "EnsembleDDPG", Spy)
-    monkeypatch.setattr(run, "update_her_buffer", spy_algorithm_1)
+    monkeypatch.setattr(run, "update_her_buffer", spy_on_the_first)
+    monkeypatch.setattr(run, "score", spy_score)
     settings = {**SMALL, "cycles": 2, "updates": 3, "batch_size": 16, "heads": 4, "num_workers": 1}
-    settings |= {"acting_head": acting_head}
+    settings |= {"acting_head": acting_head, "scored_per_drawn": 2.0, "her_buffer_capacity": 1700}
     (row,) = train(Config(**settings, env="PointMassEmptyEnv-v1", out=str(tmp_path / "run")))
     names = [call if isinstance(call, str) else call[0] for call in calls]
-    assert names == 2 * (3 * ["algorithm 1", 0, 1, 2, 3] + ["targets"])
-    batches = [call[1] for call in calls if not isinstance(call, str)]
+    sweep = ["frozen", 0, 1, 2, 3, "stored"]  # B_h stands still meanwhile
+    assert names == ["first"] + 2 * (3 * sweep + ["targets"])
+    # the scores are the critics' at the beginning of the sweep, from another thread
+    assert threading.current_thread() not in threads and len(threads) == 1
+    assert len(scores) == len(frozen) == 6
+    for (variance, rows, moved), critics in zip(scores, frozen, strict=True):
+        np.testing.assert_array_equal(variance, critics.q_variance(*rows))
+        assert np.abs(variance - moved).max() > 1e-4
+    # scored for each one drawn: 2, in each sweep
+    drawn = 4 * 16
+    assert [len(variance) for variance, *_ in scores] == 6 * [2 * drawn]
+    batches = [call[1] for call in calls if not isinstance(call, str)][1:]
     assert len(set(batches)) == len(batches)
     # warm-up and 2 cycles, in 16 environments by 4 heads or one; then a round of evaluation, by all
     assert [g.shape for g in goals] == 150 * [collecting] + 50 * [(4, 4, 2)]
@@ -1148,8 +1165,8 @@ def test_the_same_seed_gives_the_same_rows(tmp_path):
     assert head == ",".join(COLUMNS)
     # 16 environments, 50 steps: 1 warm-up and 2 cycles, then 2 cycles
     assert [row["env_steps"] for row in a] == [3 * 800, 5 * 800]
-    # 2 cycles of 2 updates, for each of which 4 mini-batches of 32 are scored
-    assert [row["her_buffer_size"] for row in a] == [2 * 2 * 4 * 32, 2 * 2 * 2 * 4 * 32]
+    # what a cycle draws, 2 updates of 16 heads; the first episodes, 2 x 16 of 50 steps, filled it
+    assert [row["her_buffer_size"] for row in a] == [2 * 16 * 32, 2 * 16 * 32]
 
 
 def test_each_seed_and_epoch_has_random_numbers_of_its_own(tmp_path, monkeypatch):
@@ -1184,8 +1201,8 @@ def test_each_seed_and_epoch_has_random_numbers_of_its_own(tmp_path, monkeypatch
         {"acting_head": "one"},
         {"heads": 1},
         {"heads": 3, "temperature": 15.0},
-        {"heads": 1, "updates": 1, "scored_per_update": 4},
-        {"her_thread": True},
+        {"heads": 1, "updates": 1, "scored_per_drawn": 4.0},
+        {"scored_per_drawn": 0.0625, "her_buffer_capacity": 64},
         {"buffer_size": 800, "cycles": 4},
     ],
     ids=str,
@@ -1196,6 +1213,35 @@ def test_every_option_runs_to_the_end(options, tmp_path):
     assert list(row.keys() - set(COLUMNS)) == [] and len(row) == len(COLUMNS)
     assert all(math.isfinite(value) for value in row.values()), row
     assert threading.active_count() == 1
+
+
+@pytest.mark.parametrize("where", ["score", "update"])
+def test_an_error_beside_the_training_ends_the_run_with_its_message(where, tmp_path, monkeypatch):
+    def fail(*args):
+        raise FloatingPointError("NaN or Inf in here")
+
+    monkeypatch.setattr(
+        *{"score": (run, "score"), "update": (EnsembleDDPG, "update_head")}[where], fail
+    )
+    settings = {**SMALL, "env": "PointMassEmptyEnv-v1", "num_workers": 1}
+    with pytest.raises(FloatingPointError, match="in here"):
+        train(Config(**settings, out=str(tmp_path / "run")))
+    assert threading.active_count() == 1
+
+
+def test_what_is_scored_fits_into_the_buffer():
+    sweep = {"heads": 4, "batch_size": 8}  # draws 32
+    for settings, capacity in (
+        ({"updates": 5}, 160),
+        ({"updates": 1, "scored_per_drawn": 2.5}, 80),
+        ({"updates": 5, "her_buffer_capacity": 40}, 40),
+    ):
+        assert options.complete(Config(**sweep, **settings)).her_buffer_capacity == capacity
+    for rate in (0.0, -1.0, math.nan, math.inf, 0.01):
+        with pytest.raises(UsageError, match=r"--scored-per-drawn must be 0.03125 or more"):
+            options.complete(Config(**sweep, scored_per_drawn=rate))
+    with pytest.raises(UsageError, match="40 transitions are scored at once, and B_h holds 39"):
+        options.complete(Config(**sweep, scored_per_drawn=1.25, her_buffer_capacity=39))
 
 
 def test_an_environment_from_outside_trains(tmp_path):
@@ -1241,7 +1287,7 @@ def test_one_cycle_of_each_of_the_sixteen(name):
     def reward_fn(achieved, desired):
         return env.unwrapped.compute_reward(achieved, desired, {})
 
-    update_her_buffer(original, buffer, agent, 256, rng, 0.8, reward_fn)
+    update_her_buffer(original, buffer, agent.q_variance, 256, rng, 0.8, reward_fn)
     rewards = buffer.data["reward"]
     assert set(np.unique(rewards)) == {-1.0, 0.0} and rewards.dtype == np.float32
     for k in range(2):

@@ -1,21 +1,22 @@
 """Value Consistency Prioritization, Section 4: what VCP adds to HER with an ensemble.
 
 `value_consistency_priority` is Eq. (4), `HERBuffer` is B_h with its priorities, and
-`update_her_buffer` is the body of Algorithm 1. These are the method; the rest is DDPG and HER.
+`update_her_buffer` is the body of Algorithm 1, of which `score` is lines 3-5. These are the method;
+the rest is DDPG and HER.
 
 Letters in the shape comments:
     N transitions in B_h    B transitions of a mini-batch
 """
 
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import numpy as np
 import torch
 
-from ensemble import EnsembleDDPG
 from her import Batch, EpisodeBuffer, RewardFn, relabel_future
+
+# σ² of Q_k(s, a, g) over the critics, of obs (B, O), action (B, A) and goal (B, G): (B,)
+QVariance = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def value_consistency_priority(
@@ -72,7 +73,6 @@ class HERBuffer:
         self.size = self._next = 0
         self.data: Batch = {}  # the batch's arrays with `capacity` rows, and "variance"
         self.probabilities = self._cumulative = np.empty(0)  # (size,)
-        self._lock = threading.Lock()  # a row must not be read while it is half written
 
     def add(self, batch: Batch, variance: np.ndarray) -> None:
         """Algorithm 1, line 6: store the mini-batch over the oldest transitions.
@@ -85,27 +85,24 @@ class HERBuffer:
                 name: np.empty((self.capacity, *x.shape[1:]), x.dtype) for name, x in batch.items()
             }
         slots = (self._next + np.arange(len(variance))) % self.capacity
-        with self._lock:
-            for name, x in batch.items():
-                self.data[name][slots] = x
+        for name, x in batch.items():
+            self.data[name][slots] = x
         self._next = (self._next + len(variance)) % self.capacity
         self.size = min(self.size + len(variance), self.capacity)
 
     def update_priorities(self) -> None:
         """Algorithm 1, line 7: Eq. (4) over all of B_h, from the stored variances. O(N)."""
-        probabilities = self._priority(self.data["variance"][: self.size], self.temperature)
-        cumulative = probabilities.cumsum()
-        with self._lock:
-            self.probabilities, self._cumulative = probabilities, cumulative / cumulative[-1]
+        self.probabilities = self._priority(self.data["variance"][: self.size], self.temperature)
+        cumulative = self.probabilities.cumsum()
+        self._cumulative = cumulative / cumulative[-1]
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
         """Algorithm 2, line 15: draw with replacement by the normalised priorities, O(log N) each.
         Gives the stored arrays' rows and "weight" (B,) float32, the factor of each in the loss."""
-        with self._lock:
-            # Inverse transform sampling: the first i with p_1 + ... + p_i > u.
-            i = np.searchsorted(self._cumulative, rng.random(batch_size), side="right")
-            batch = {name: x[i] for name, x in self.data.items()}
-            weight = self._importance(self.probabilities[i])
+        # Inverse transform sampling: the first i with p_1 + ... + p_i > u.
+        i = np.searchsorted(self._cumulative, rng.random(batch_size), side="right")
+        batch = {name: x[i] for name, x in self.data.items()}
+        weight = self._importance(self.probabilities[i])
         batch["weight"] = (weight / weight.mean()).astype(np.float32)
         return batch
 
@@ -123,48 +120,39 @@ class HERBuffer:
         self.update_priorities()
 
 
+def score(
+    original_buffer: EpisodeBuffer,
+    q_variance: QVariance,
+    batch_size: int,
+    rng: np.random.Generator,
+    relabel_ratio: float,
+    reward_fn: RewardFn,
+) -> tuple[Batch, np.ndarray]:
+    """Algorithm 1, lines 3-5. Returns a mini-batch (`relabel_future`) and its variances (B,).
+
+    It changes nothing, so it can run in a thread of its own while the heads are trained, as
+    Algorithm 2, line 13, has it, if q_variance belongs to critics that stand still:
+    `EnsembleDDPG.frozen_q_variance`.
+    """
+    # 3-4: a mini-batch of B_o, its goals relabelled by 'future'
+    batch = relabel_future(original_buffer.episodes, batch_size, rng, relabel_ratio, reward_fn)
+    # 5: the variance of the K Q-values of each transition
+    return batch, q_variance(batch["obs"], batch["action"], batch["goal"])
+
+
 def update_her_buffer(
     original_buffer: EpisodeBuffer,
     her_buffer: HERBuffer,
-    agent: EnsembleDDPG,
+    q_variance: QVariance,
     batch_size: int,
     rng: np.random.Generator,
     relabel_ratio: float,
     reward_fn: RewardFn,
 ) -> None:
-    """Algorithm 1, lines 3-7, once. `in_thread` is the loop around them."""
-    # 3-4: a mini-batch of B_o, its goals relabelled by 'future'
-    batch = relabel_future(original_buffer.episodes, batch_size, rng, relabel_ratio, reward_fn)
-    # 5: the variance of the K Q-values of each transition
-    variance = agent.q_variance(batch["obs"], batch["action"], batch["goal"])
+    """Algorithm 1, lines 3-7, once, for a mini-batch of `batch_size` transitions.
+    ValueError if it exceeds the capacity of B_h."""
+    batch, variance = score(
+        original_buffer, q_variance, batch_size, rng, relabel_ratio, reward_fn
+    )  # 3-5
     her_buffer.add(batch, variance)  # 6
     her_buffer.update_priorities()  # 7
-
-
-@contextmanager
-def in_thread(step: Callable[[], None]) -> Iterator[None]:
-    """Algorithm 1, lines 2 and 8, and Algorithm 2, line 13: call `step` over and over in another
-    thread while the block runs, and once before, so that the block finds something to draw. What
-    it raises is raised where the block ends.
-
-    How often it is called depends on the machine's load, so runs differ even with the same seed.
-    """
-    step()
-    stop, errors = threading.Event(), []
-
-    def loop():
-        try:
-            while not stop.is_set():
-                step()
-        except Exception as error:
-            errors.append(error)
-
-    thread = threading.Thread(target=loop, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
-    if errors:
-        raise errors[0]

@@ -29,18 +29,27 @@ def available_cores() -> list[int]:
 
 
 @contextmanager
-def small_calls():
-    """Run the block's PyTorch calls on one thread and without `fast_products`: acting is too little
-    work for more, and idle threads that spin in wait for the next call would take the cores from
-    the environments."""
-    products = torch.backends.mkldnn.matmul
-    threads, precision = torch.get_num_threads(), products.fp32_precision
+def one_thread():
+    """Run the block's PyTorch calls on one thread each. Products of this size gain little from
+    more, and where a core is busy with something else, threads that meet after each product wait
+    for it every time: on a busy machine a run with two was a hundred times slower."""
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    products.fp32_precision = "ieee"
     try:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+@contextmanager
+def small_calls():
+    """Run the block without `fast_products`: acting is too little work for it."""
+    products = torch.backends.mkldnn.matmul
+    precision = products.fp32_precision
+    products.fp32_precision = "ieee"
+    try:
+        yield
+    finally:
         products.fp32_precision = precision
 
 

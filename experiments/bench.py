@@ -7,10 +7,13 @@ environment, the same epoch with `--priority uniform`. Medians, with the quartil
 
 import argparse
 import os
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import redirect_stdout
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, redirect_stdout
 
 import numpy as np
 import torch
@@ -20,8 +23,8 @@ from ensemble import HIDDEN, EnsembleDDPG
 from envs_point import make_env
 from her import EpisodeBuffer
 from options import METHODS, complete
-from vcp import update_her_buffer
-from workers import ParallelEnvs, available_cores, fast_products
+from vcp import score, update_her_buffer
+from workers import ParallelEnvs, available_cores, fast_products, one_thread
 
 SIZES = {"FetchReach-v1": (10, 3, 4), "FetchPush-v1": (25, 3, 4), "HandReach-v0": (63, 15, 20)}
 PAPER_MINUTES = {2: 3.2, 4: 5.6, 8: 8.5, 16: 12.0, 32: 20.7}  # Table 2, HandReach
@@ -178,35 +181,61 @@ def replay_of(config: run.Config, original: EpisodeBuffer):
     return run.make_replay(config, env, original, reward_fn), reward_fn
 
 
-def bench_priorities(repeats: int, heads: int = 16) -> None:
-    print("\n3. Scoring, Eq. (4) and sampling with B_h full, as a share of a cycle's training")
-    print(f"{'sizes of':14} {'scored':>8} {'score+Eq.(4) ms':>22} {'sample ms':>22} {'share':>6}")
+@contextmanager
+def busy_core():
+    """Another process that never rests, on one of the cores."""
+    core = available_cores()[0]
+    program = f"import os; os.sched_setaffinity(0, {{{core}}})\nwhile True: pass"
+    process = subprocess.Popen([sys.executable, "-c", program])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+def bench_algorithm_1(repeats: int, heads: int = 16) -> None:
+    print(
+        "\n3. A sweep of the heads, B_h full: Algorithm 1 beside it (line 13), in turn, left out;"
+    )
+    print("   one transition scored for each one drawn. Busy: another process on one of the cores")
+    names = ["left out", "beside", "in turn"]
+    heading = "".join(f"{name:>20}" for name in names)
+    print(f"{'ms, sizes of':14} {heading}  beside by left out, by in turn")
     for name in ("FetchPush-v1", "HandReach-v0"):
-        batch, rng = 256, np.random.default_rng(0)
+        size, rng = 256, np.random.default_rng(0)
         agent = EnsembleDDPG(*SIZES[name], gamma=0.98, heads=heads)
         original = full_buffer(name, rng)
         her_buffer, reward_fn = replay_of(complete(run.Config(env=name, heads=heads)), original)
-
-        def score(size, agent=agent, buffers=(original, her_buffer), rng=rng, reward_fn=reward_fn):
-            update_her_buffer(*buffers, agent, size, rng, 0.8, reward_fn)
-
+        how = (heads * size, np.random.default_rng(1), 0.8, reward_fn)
         while her_buffer.size < her_buffer.capacity:
-            score(10 * batch)
-        data = her_buffer.sample(batch, rng)
-        for scored in (1, heads):
-            t = in_turn(
-                {
-                    "score": lambda: score(scored * batch),  # noqa: B023
-                    "sample": lambda: [her_buffer.sample(batch, rng) for _ in range(heads)],  # noqa: B023
-                    "update": lambda: [agent.update_head(k, data) for k in range(heads)],  # noqa: B023
-                },
-                repeats,
-            )
-            ours = np.median(t["score"]) + np.median(t["sample"])
-            print(
-                f"{name:14} {scored:>3} : {heads:<2} {spread(t['score'], 1e3):>22}"
-                f" {spread(t['sample'], 1e3):>22} {ours / (ours + np.median(t['update'])):6.1%}"
-            )
+            update_her_buffer(original, her_buffer, agent.q_variance, *how)
+
+        def train(agent=agent, her_buffer=her_buffer, rng=rng):
+            for k in range(heads):
+                agent.update_head(k, her_buffer.sample(256, rng))
+
+        def beside(agent=agent, original=original, her_buffer=her_buffer, how=how, train=train):
+            scoring = thread.submit(score, original, agent.frozen_q_variance(), *how)
+            train()
+            her_buffer.add(*scoring.result())
+            her_buffer.update_priorities()
+
+        def in_turn_with_it(agent=agent, buffers=(original, her_buffer), how=how, train=train):
+            update_her_buffer(*buffers, agent.q_variance, *how)
+            train()
+
+        with ThreadPoolExecutor(1) as thread, fast_products():
+            ways = dict(zip(names, (train, beside, in_turn_with_it), strict=True))
+            t = in_turn(ways, repeats)
+            with busy_core():
+                busy = in_turn({"beside": beside}, repeats)["beside"]
+        columns = "".join(f"{spread(t[n], 1e3):>20}" for n in names)
+        ratios = [np.median(t["beside"]) / np.median(t[n]) for n in ("left out", "in turn")]
+        slower = np.median(busy) / np.median(t["beside"])
+        print(
+            f"{name:14} {columns}  {ratios[0]:10.2f} {ratios[1]:10.2f}; busy {slower:.2f} of itself"
+        )
 
 
 def cycle_seconds(cycles: int, **settings) -> dict[str, float]:
@@ -229,7 +258,7 @@ def cycle_seconds(cycles: int, **settings) -> dict[str, float]:
 
 def bench_epochs(cycles: int, repeats: int, names: list[str]) -> None:
     print("\n4. An epoch at the paper's settings, beside the same epoch with --priority uniform")
-    print("   (which scores B_h too: without any scoring it would lack section 3's share)")
+    print("   (which scores B_h too)")
     for name in names:
         t = {"consistency": [], "uniform": []}
         for _ in range(repeats):
@@ -303,6 +332,7 @@ def bench_methods(cycles: int) -> None:
         print(f"{method:8}", *columns)
 
 
+@one_thread()
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--quick", action="store_true", help="1 to 4 and 6, with fewer repeats")
@@ -311,7 +341,7 @@ def main() -> None:
     bench_update(2 if quick else 20)
     with fast_products():
         bench_collection(2 if quick else 10)
-        bench_priorities(1 if quick else 15)
+        bench_algorithm_1(1 if quick else 15)
     if quick:
         bench_epochs(1, 1, ["FetchPush-v1"])
     else:

@@ -9,7 +9,7 @@ import math
 import re
 import sys
 from collections import defaultdict
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +41,8 @@ def read_runs(folder: Path) -> list[Run]:
         rows = read_rows(file.parent)
         if rows:
             columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-            runs.append(Run(options.load(file.parent), columns))
+            config = replace(options.load(file.parent), device="cpu", tensorboard=False)
+            runs.append(Run(options.complete(config), columns))
     return runs
 
 
@@ -59,7 +60,8 @@ def as_many_updates(c: Config) -> bool:
 
 # Settings that the panel's title or the label's own words say, or that need no saying, as the
 # training does not depend on them or all seeds are one line.
-SAID_ELSEWHERE = ("env", "cycles", "updates", "batch_size", "seed", "eval_episodes")
+SCHEDULE = ("cycles", "updates", "batch_size")
+SAID_ELSEWHERE = ("env", *SCHEDULE, "seed", "eval_episodes")
 SAID_ELSEWHERE += ("method", "heads", "priority", "acting_head", *options.MAY_CHANGE)
 
 
@@ -74,9 +76,9 @@ def label(c: Config) -> str:
         parts.append(f"{c.priority} priority")
     if c.acting_head == "one":
         parts.append("one acting head")
-    scored = options.paper_schedule(c.env, c.method)["scored_per_update"]
-    rate = options.trunk_rate(c.updates, c.heads)
-    default = Config(scored_per_update=scored, trunk_rate=rate)
+    default = options.complete(
+        Config(c.env, c.method, heads=c.heads, **{n: getattr(c, n) for n in SCHEDULE})
+    )
     for name in (f.name for f in fields(Config) if f.name not in SAID_ELSEWHERE):
         if getattr(c, name) != getattr(default, name):
             parts.append(f"{name} {getattr(c, name)}")

@@ -32,11 +32,15 @@ def share_ahead(its: SimpleNamespace, method: str, rng: np.random.Generator) -> 
     if method == "vcp" and heads == 1:
         return math.nan
     schedule = options.paper_schedule("FetchPush-v1", method)
-    config = Config(its.config.env, method, heads=heads, relabel_ratio=ratio, **schedule)
+    config = options.complete(
+        Config(its.config.env, method, heads=heads, relabel_ratio=ratio, **schedule)
+    )
     replay = run.make_replay(config, its.env, its.original, its.reward_fn)
     if method == "vcp":
         for _ in range(replay.capacity // SCORED):
-            update_her_buffer(its.original, replay, its.agent, SCORED, rng, ratio, its.reward_fn)
+            update_her_buffer(
+                its.original, replay, its.agent.q_variance, SCORED, rng, ratio, its.reward_fn
+            )
     else:
         replay.new_episodes(np.arange(its.original.size))
     drawn = [replay.sample(config.batch_size, rng) for _ in range(BATCHES)]

@@ -113,7 +113,8 @@ def test_each_figure_has_its_runs(name, lines, results, monkeypatch):
     [
         ({"temperature": 1.0}, "VCP, temperature 1.0"),
         ({"buffer_size": 10_000}, "VCP, buffer_size 10000"),
-        ({"scored_per_update": 1}, "VCP, scored_per_update 1"),
+        ({"scored_per_drawn": 0.25}, "VCP, scored_per_drawn 0.25"),
+        ({"her_buffer_capacity": 1280}, "VCP, her_buffer_capacity 1280"),
         ({"action_penalty": 0.1, "noise": 0.1}, "VCP, noise 0.1, action_penalty 0.1"),
         ({"env": "FetchPush-v1"}, "VCP"),
         ({"env": "FetchPush-v1", "trunk_rate": 1.0}, "VCP, trunk_rate 1.0"),
@@ -312,8 +313,8 @@ def test_what_a_sweep_consists_of(tmp_path):
         for name in ("vcp", "method-her_heads-1", "relabel_ratio-0.5")
     ]
     assert (runs[1].method, runs[1].heads, runs[1].epochs) == ("her", 1, 20)
-    assert sweep.settings("her_thread=True,temperature=5") == {
-        "her_thread": True,
+    assert sweep.settings("faithful=True,temperature=5") == {
+        "faithful": True,
         "temperature": 5.0,
     }
 
@@ -325,7 +326,7 @@ def test_what_a_sweep_consists_of(tmp_path):
         "--variants heads=many",
         "--variants method=sac",
         "--variants heads=0",
-        "--variants her_thread=true",
+        "--variants faithful=true",
         "--seeds many",
         "--task 1",
     ],
