@@ -30,12 +30,12 @@ class MultiHeadMLP:
     """Figure 1(a) and Appendix B: a trunk of two layers that all heads share, then, for each head,
     one more layer of 256 units and an output.
 
+    `net(k, x)` is head k's network, the one to train, with an optimiser over `net.parameters()`;
+    `net.all_heads(x)` is all of them in one call, without gradients.
+
     Each hidden layer is followed by a ReLU, as in HER's code, where Appendix B takes the networks
     from (the released code has none where the trunk ends: NOTES.md, "the end of the trunk").
-    `squash` is applied to the output: torch.tanh for the actor, None for the critic.
-
-    The heads are stacked along a first axis, so one call evaluates all of them, and `head(k)` is a
-    list of views into the same memory, so training head k changes exactly its slice and the trunk.
+    squash: applied to the output; torch.tanh for the actor, None for the critic.
     """
 
     def __init__(self, inputs, outputs, heads, squash, generator, device="cpu"):
@@ -48,26 +48,32 @@ class MultiHeadMLP:
 
         self.squash = squash or (lambda x: x)
         self.trunk = [xavier(HIDDEN, inputs), zeros(HIDDEN), xavier(HIDDEN, HIDDEN), zeros(HIDDEN)]
-        self.heads = [xavier(heads, HIDDEN, HIDDEN), zeros(heads, HIDDEN)]
+        self.heads = [xavier(heads, HIDDEN, HIDDEN), zeros(heads, HIDDEN)]  # stacked, (K, ...)
         self.heads += [xavier(heads, outputs, HIDDEN), zeros(heads, outputs)]
-        self._head = [[*self.trunk, *(p[k] for p in self.heads)] for k in range(heads)]
+        # Head k's own four tensors: views into the stacks, so training it changes its slice alone.
+        self.own = [[p[k] for p in self.heads] for k in range(heads)]
 
-    def head(self, k: int) -> list[torch.Tensor]:
-        """The eight tensors of head k's network: the shared trunk's four, then its own four."""
-        return self._head[k]
+    def parameters(self) -> list[torch.Tensor]:
+        """The trunk's four tensors, then four of each head."""
+        return [*self.trunk, *(p for own in self.own for p in own)]
 
-    def forward(self, params: list[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
-        """The network with the tensors `params`: `head(k)` maps (B, I) to (B, J)."""
+    def __call__(self, k: int, x: torch.Tensor, frozen: bool = False) -> torch.Tensor:
+        """Head k's network, (B, I) -> (B, J). frozen: without gradients for its parameters."""
+        params = [*self.trunk, *self.own[k]]
+        return self._forward([p.detach() for p in params] if frozen else params, x)
+
+    @torch.no_grad()
+    def all_heads(self, x: torch.Tensor, heads: slice = slice(None)) -> torch.Tensor:
+        """The chosen heads in one call. x is (K, E, I), rows of their own for each head, or (B, I),
+        the same rows for all; returns (K, E, J) or (K, B, J)."""
+        return self._forward([*self.trunk, *(p[heads] for p in self.heads)], x)
+
+    def _forward(self, params: list[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
         w1, b1, w2, b2, w3, b3, w4, b4 = params
         h = linear(x, w1, b1).relu_()  # in place: at this size a fresh array costs as much as it
         h = linear(h, w2, b2).relu_()  # the embedding of Figure 1(a)
         h = linear(h, w3, b3).relu_()
         return self.squash(linear(h, w4, b4))
-
-    def forward_heads(self, x: torch.Tensor, heads: slice = slice(None)) -> torch.Tensor:
-        """The chosen heads in one call. x is (K, E, I), rows of their own for each head, or (B, I),
-        the same rows for all; gives (K, E, J) or (K, B, J)."""
-        return self.forward([*self.trunk, *(p[heads] for p in self.heads)], x)
 
 
 class Normalizer:
@@ -112,7 +118,7 @@ class EnsembleDDPG:
     """DDPG with K heads, Section 4.1: head k has its own actor, critic, target actor and target
     critic, and is trained on mini-batches of its own (Algorithm 2, lines 14-17).
 
-    All methods take and give NumPy arrays; actions are in [-1, 1].
+    All methods take and return NumPy arrays; actions are in [-1, 1].
     gamma: discount (the paper does not say; 1 - 1/T for episodes of T steps).
     trunk_rate: the trunks' share of the learning rate. 1 is Algorithm 2 to the letter: the trunks
         take K whole steps, one with each head. With 1/K these add up to one (NOTES.md).
@@ -157,10 +163,11 @@ class EnsembleDDPG:
         # gradient. With an Adam for each head, each with moments of its own for the trunks, as in
         # the released code, the trunks die (NOTES.md, "the trunks' Adam").
         nets = (self.actor, self.critic)
+        for net in nets:
+            for p in net.parameters():
+                p.requires_grad_()
         trunks = [p for net in nets for p in net.trunk]
-        own = [p for net in nets for k in range(heads) for p in net.head(k)[4:]]
-        for p in trunks + own:
-            p.requires_grad_()
+        own = [p for net in nets for p in net.parameters()[4:]]
         rates = [{"params": trunks, "lr": learning_rate * trunk_rate}, {"params": own}]
         self.optimizer = torch.optim.Adam(rates, learning_rate, fused=True)
 
@@ -170,13 +177,13 @@ class EnsembleDDPG:
     def act(self, obs: np.ndarray, goal: np.ndarray, heads: slice = slice(None)) -> np.ndarray:
         """Algorithm 2, line 7, without noise: a = μ_k(s, g) for all heads in one call.
         obs (K, E, O) and goal (K, E, G) -> (K, E, A); `heads` picks which K heads act."""
-        return self.actor.forward_heads(self._state(obs, goal), heads).cpu().numpy()
+        return self.actor.all_heads(self._state(obs, goal), heads).cpu().numpy()
 
     @torch.no_grad()
     def value(self, obs: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Q_k(s, μ_k(s, g), g), what head k expects of its own policy. (K, E, ...) -> (K, E)."""
         state = self._state(obs, goal)
-        q = self.critic.forward_heads(torch.cat([state, self.actor.forward_heads(state)], -1))
+        q = self.critic.all_heads(torch.cat([state, self.actor.all_heads(state)], -1))
         return q.squeeze(-1).cpu().numpy()
 
     def q_variance(self, obs: np.ndarray, action: np.ndarray, goal: np.ndarray) -> np.ndarray:
@@ -195,7 +202,7 @@ class EnsembleDDPG:
     @torch.no_grad()
     def _q_variance(self, critic: MultiHeadMLP, obs, action, goal) -> np.ndarray:
         state_action = torch.cat([self._state(obs, goal), self._tensor(action)], -1)
-        q = critic.forward_heads(state_action).squeeze(-1)  # (K, B)
+        q = critic.all_heads(state_action).squeeze(-1)  # (K, B)
         return q.var(dim=0, correction=0).cpu().numpy()
 
     # ---------------------------------------------------------------- learning
@@ -205,7 +212,7 @@ class EnsembleDDPG:
 
         batch: obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,) and weight (B,).
         It moves head k and both trunks, no other head. Both gradients are taken before either
-        step. There is no terminal state: episodes have a fixed length. Gives (2,), the losses of
+        step. There is no terminal state: episodes have a fixed length. Returns (2,), the losses of
         critic and actor.
         """
         state = self._state(batch["obs"], batch["goal"])  # (B, O+G)
@@ -213,24 +220,20 @@ class EnsembleDDPG:
         action = self._tensor(batch["action"])
         reward = self._tensor(batch["reward"])[:, None]  # (B, 1)
         weight = self._tensor(batch["weight"])[:, None]
-        critic, actor = self.critic.head(k), self.actor.head(k)
 
         with torch.no_grad():  # y = r + γ Q̄_k(s', μ̄_k(s', g), g), head k's own targets
-            next_action = self.target_actor.forward(self.target_actor.head(k), next_state)
-            next_q = self.target_critic.forward(
-                self.target_critic.head(k), torch.cat([next_state, next_action], 1)
-            )
+            next_action = self.target_actor(k, next_state)
+            next_q = self.target_critic(k, torch.cat([next_state, next_action], 1))
             # Rewards are -1 or 0, so every return lies in [-1/(1-γ), 0] (not in the paper).
             target = (reward + self.gamma * next_q).clamp(-1 / (1 - self.gamma), 0)
 
         # Eq. (2): L(φ_k) = E[w (Q_k(s, a, g) - y)²]
-        q = self.critic.forward(critic, torch.cat([state, action], 1))
+        q = self.critic(k, torch.cat([state, action], 1))
         critic_loss = (weight * (q - target).square()).mean()
 
         # Eq. (3): maximise E[w Q_k(s, μ_k(s, g), g)] over θ_k, with a penalty on large actions
-        frozen = [p.detach() for p in critic]
-        policy = self.actor.forward(actor, state)
-        policy_q = self.critic.forward(frozen, torch.cat([state, policy], 1))
+        policy = self.actor(k, state)
+        policy_q = self.critic(k, torch.cat([state, policy], 1), frozen=True)
         actor_loss = -(weight * policy_q).mean()
         actor_loss = actor_loss + self.action_penalty * (weight * policy.square()).mean()
 

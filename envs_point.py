@@ -1,14 +1,10 @@
-"""The environments of Appendix A: PointMass and the sparse Reacher, and `make_env`, which knows the
-paper's sixteen names and takes any other goal environment.
+"""The environments of Appendix A that are ours: PointMass and the sparse Reacher.
 
 Goal environments: the observation is a dict of "observation", "achieved_goal" and "desired_goal",
 and `compute_reward(achieved, desired, info)` is Eq. (1): 0 where the goal is reached, else -1.
-Lengths are in metres; an episode of the paper's has 50 steps.
+Lengths are in metres; an episode has 50 steps. Importing this module registers them with gymnasium.
 """
 
-import contextlib
-import difflib
-import io
 import math
 
 import gymnasium as gym
@@ -16,14 +12,6 @@ import mujoco
 import numpy as np
 from gymnasium.envs.mujoco.reacher_v5 import ReacherEnv
 from gymnasium.spaces import Box
-
-with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice about other environments
-    import gymnasium_robotics
-gym.register_envs(gymnasium_robotics)
-
-
-class UsageError(ValueError):
-    """What was asked for cannot be done. run.py prints it as one line and exits with code 2."""
 
 
 def goal_space(obs_dim: int, goal_dim: int, bound: float = np.inf) -> gym.spaces.Dict:
@@ -228,104 +216,6 @@ class SparseReacher(ReacherEnv):
         return spatial[3:5]
 
 
-# -------------------------------------------------------------------------------- names
-
 gym.register("PointMassEmptyEnv-v1", PointMass, max_episode_steps=50)
 gym.register("PointMassWallEnv-v1", PointMass, max_episode_steps=50, kwargs={"wall": True})
 gym.register("SparseReacher-v1", SparseReacher, max_episode_steps=50)
-
-PAPER_LENGTH = 50  # T, for all sixteen; today's Hand manipulation tasks stop at 100 by themselves
-PAPER_ENVS = {  # the paper's name -> today's id
-    "FetchReach-v1": "FetchReach-v4",
-    "FetchPush-v1": "FetchPush-v4",
-    "FetchSlide-v1": "FetchSlide-v4",
-    "FetchPickAndPlace-v1": "FetchPickAndPlace-v4",
-    "HandReach-v0": "HandReach-v3",
-    "HandManipulatePenFull-v0": "HandManipulatePenFull-v1",
-    "HandManipulatePenRotate-v0": "HandManipulatePenRotate-v1",
-    "HandManipulateEggFull-v0": "HandManipulateEggFull-v1",
-    "HandManipulateEggRotate-v0": "HandManipulateEggRotate-v1",
-    "HandManipulateBlockFull-v0": "HandManipulateBlockFull-v1",
-    "HandManipulateBlockRotateParallel-v0": "HandManipulateBlockRotateParallel-v1",
-    "HandManipulateBlockRotateXYZ-v0": "HandManipulateBlockRotateXYZ-v1",
-    "HandManipulateBlockRotateZ-v0": "HandManipulateBlockRotateZ-v1",
-    "Reacher-v2": "SparseReacher-v1",
-    "PointMassEmptyEnv-v1": "PointMassEmptyEnv-v1",
-    "PointMassWallEnv-v1": "PointMassWallEnv-v1",
-}
-MISSPELT = {  # as Appendix A prints two of them
-    "FetchSilce-v1": "FetchSlide-v1",
-    "FetchPickAndPlac-v1": "FetchPickAndPlace-v1",
-}
-
-
-def describe(name: str) -> str:
-    """One line: which environment `make_env(name)` makes, and how it differs from the paper's."""
-    name = MISSPELT.get(name, name)
-    made = PAPER_ENVS.get(name, name)
-    if name not in PAPER_ENVS:
-        return f"{name}: not one of the paper's sixteen, made as it is"
-    if made.startswith("PointMass"):
-        difference = "our NumPy version of the paper's MuJoCo model, without inertia"
-    elif made.startswith("SparseReacher"):
-        difference = f"our sparse version of Reacher-v5, MuJoCo {mujoco.__version__}"
-    else:
-        difference = f"MuJoCo {mujoco.__version__}, so the physics differ a little from the paper's"
-    return f"{name}: made {made} ({difference}), {PAPER_LENGTH} steps an episode"
-
-
-def make_env(name: str, **kwargs) -> gym.Env:
-    """Make a goal environment by the paper's name, by a current id or as module:ID.
-
-    The paper's names get episodes of 50 steps, all others their own length; actions are rescaled to
-    [-1, 1]. kwargs go to the environment. UsageError, one line, for an unknown name and for what
-    this method cannot learn: no goals, no Box of actions, no vectorised `compute_reward` of -1 and
-    0, no fixed episode length.
-    """
-    name = MISSPELT.get(name, name)
-    length = PAPER_LENGTH if name in PAPER_ENVS else None
-    try:
-        env = gym.make(
-            PAPER_ENVS.get(name, name), max_episode_steps=length, disable_env_checker=True, **kwargs
-        )
-    except (gym.error.Error, ModuleNotFoundError) as error:
-        ids = [i for i, s in gym.registry.items() if "obotics" in str(s.entry_point)]
-        close = difflib.get_close_matches(name, {*PAPER_ENVS, *ids}, n=3, cutoff=0.5)
-        hint = f"; the nearest names are {', '.join(close)}" if close else ""
-        message = " ".join(str(error).split()).rstrip(".")
-        raise UsageError(f"cannot make the environment {name}: {message}{hint}") from error
-    problem = _what_is_missing(env)
-    if problem:
-        env.close()
-        raise UsageError(f"cannot learn in the environment {name}: {problem}")
-    if not (np.all(env.action_space.low == -1) and np.all(env.action_space.high == 1)):
-        env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
-    return env
-
-
-def _what_is_missing(env: gym.Env) -> str | None:
-    keys = ("observation", "achieved_goal", "desired_goal")
-    space, action = env.observation_space, env.action_space
-    if not (isinstance(space, gym.spaces.Dict) and set(keys) <= set(space.keys())):
-        return f"it has no goals (its observation is not a dict of {', '.join(keys)})"
-    if not all(isinstance(space[k], Box) and len(space[k].shape) == 1 for k in keys):
-        return f"its {', '.join(keys)} are not all flat Boxes"
-    if not (isinstance(action, Box) and len(action.shape) == 1):
-        return f"its action space is {action}, not a flat Box"
-    if not action.is_bounded():
-        return f"its actions have no bounds ({action})"
-    if not callable(getattr(env.unwrapped, "compute_reward", None)):
-        return "it has no compute_reward(achieved_goal, desired_goal, info)"
-    if env.spec.max_episode_steps is None:
-        return "it has no episode length (register it with max_episode_steps)"
-    obs, _ = env.reset()
-    pairs = (
-        np.stack([obs["achieved_goal"]] * 3),
-        np.stack([obs["achieved_goal"], obs["desired_goal"], obs["desired_goal"]]),
-    )
-    rewards = np.asarray(env.unwrapped.compute_reward(*pairs, {}))
-    if rewards.shape != (3,):
-        return f"its compute_reward is not vectorised: 3 pairs of goals gave {rewards.shape}"
-    if rewards[0] != 0 or not np.isin(rewards, (-1, 0)).all():
-        return f"its rewards are not the -1 and 0 (reached) of Eq. (1), but {rewards[:2]}"
-    return None

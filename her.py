@@ -40,8 +40,8 @@ class EpisodeBuffer:
 
     def add(self, episodes: dict[str, np.ndarray], rng: np.random.Generator) -> np.ndarray:
         """Algorithm 2, line 9, for whole episodes. Once full, random old episodes make room (not in
-        the paper; HER's code does so). Gives the rows they went to. ValueError for more episodes
-        than the buffer holds."""
+        the paper; HER's code does so). Returns the rows they went to. ValueError for more
+        episodes than the buffer holds."""
         new = len(episodes["action"])
         if new > self.capacity:
             raise ValueError(f"{new} episodes do not fit into a buffer of {self.capacity}")
@@ -74,7 +74,7 @@ def future_goals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Section 3.2: goals for the transitions t (B,) of the episodes e (B,). With probability
     `relabel_ratio` one that was achieved later in the same episode, else the one it was played for.
-    Gives the goals (B, G) and which of them are hindsight's (B,) bool."""
+    Returns the goals (B, G) and which of them are hindsight's (B,) bool."""
     horizon = episodes["action"].shape[1]
     hindsight = rng.random(len(e)) < relabel_ratio
     future = rng.integers(t + 1, horizon + 1)  # t' ~ U{t+1, ..., T}
@@ -91,7 +91,7 @@ def transitions(
     reward_fn: RewardFn,
 ) -> Batch:
     """The transitions t (B,) of the episodes e (B,) with the goals (B, G) and their rewards.
-    Gives what `relabel_future` gives."""
+    Returns what `relabel_future` returns."""
     # r(s, a, g) asks whether the action led to the goal, so it reads the NEXT achieved goal.
     reward = np.asarray(reward_fn(episodes["achieved_goal"][e, t + 1], goal), dtype=np.float32)
     if not np.isfinite(reward).all():
@@ -119,7 +119,8 @@ def relabel_future(
     relabel_ratio: probability that a transition gets a new goal. HER's k = 4 additional goals
         (Appendix B) is the ratio k/(1+k) = 0.8; nothing is stored k times.
     reward_fn: Eq. (1), vectorised: (B, G) achieved and (B, G) desired goals -> (B,) of -1 and 0.
-    Gives obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,), hindsight (B,) bool.
+    Returns obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,) and hindsight (B,),
+        a bool.
     FloatingPointError for a reward that is NaN or Inf.
     """
     n, horizon = episodes["action"].shape[:2]
@@ -127,47 +128,3 @@ def relabel_future(
     t = rng.integers(horizon, size=batch_size)  # 0 .. T-1
     goal, hindsight = future_goals(episodes, e, t, rng, relabel_ratio)
     return transitions(episodes, e, t, goal, hindsight, reward_fn)
-
-
-class HERReplay:
-    """HER by itself (`--method her`): mini-batches straight from B_o, relabelled as they are drawn.
-
-    The replays in baselines/ differ from it in `draw`, and in what they note of new episodes.
-    at_once: how many mini-batches one `draw` makes. Nothing they depend on changes within a cycle,
-        so that this is a matter of speed alone; a divisor of those a cycle takes leaves none over.
-    """
-
-    def __init__(
-        self, buffer: EpisodeBuffer, relabel_ratio: float, reward_fn: RewardFn, at_once: int = 1
-    ):
-        self.buffer, self.relabel_ratio, self.reward_fn = buffer, relabel_ratio, reward_fn
-        self.at_once, self._left = at_once, 0
-        self.data: Batch = {}  # what was drawn last, at_once mini-batches
-        self.size = 0  # its rows
-
-    def new_episodes(self, slots: np.ndarray) -> None:
-        """B_o has new episodes in the rows `slots`: what was drawn without them is dropped."""
-        self._left = 0
-
-    def draw(self, count: int, batch_size: int, rng: np.random.Generator) -> Batch:
-        """`count` mini-batches, one after the other in arrays of count·batch_size rows."""
-        size = count * batch_size
-        episodes = self.buffer.episodes
-        return relabel_future(episodes, size, rng, self.relabel_ratio, self.reward_fn)
-
-    def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
-        """The next mini-batch, with a "weight" of 1 for each transition."""
-        if not self._left:
-            self.data = self.draw(self.at_once, batch_size, rng)
-            self._left, self.size = self.at_once, self.at_once * batch_size
-        first = (self.at_once - self._left) * batch_size
-        self._left -= 1
-        rows = slice(first, first + batch_size)
-        batch = {name: x[rows] for name, x in self.data.items()}
-        return {**batch, "weight": np.ones(batch_size, np.float32)}
-
-    def state_dict(self) -> dict:
-        return {}  # all of it follows from B_o
-
-    def load_state_dict(self, state: dict) -> None:
-        self.new_episodes(np.arange(self.buffer.size))

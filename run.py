@@ -1,263 +1,201 @@
-"""Algorithm 2, the VCP algorithm, line by line.
+"""Algorithm 2, the VCP algorithm, in the order of its box.
 
     python run.py --env FetchReach-v1
 
-`train` is the algorithm. Its lines 3-11, which play the episodes, are in rollout.py, its settings
-and the command line's in options.py.
+`train` is the algorithm. Where a line of the box begins, its number stands at the end of the line
+of code; `+` marks what is not in the box, and says where it is from. HER+ is HER's published code,
+VCP+ the authors' (NOTES.md, "Hyper-parameters"). Algorithm 1 is in vcp.py. What is set up before
+comes from harness/assemble.py, what is written down afterwards goes to harness/records.py.
+
+Letters in the shape comments:
+    K heads    N environments, n of them    T steps of an episode    O observation    G goal
+    A action
 """
 
 import math
-import sys
 import time
-from collections import defaultdict
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
-import torch
-from tqdm import tqdm
 
-import options
-import records
 from ensemble import EnsembleDDPG
-from envs_point import UsageError, describe, make_env
-from her import EpisodeBuffer, HERReplay, relabel_future
-from options import Config
-from rollout import actor, evaluate, explorer, rollout
-from vcp import HERBuffer, score, update_her_buffer
-from workers import ParallelEnvs, fast_products, one_thread, without_denormals
+from harness import cli, numerics, records
+from harness.assemble import assemble
+from harness.settings import Config, complete, scored_a_sweep
+from harness.workers import ParallelEnvs, Worker
+from her import relabel_future
+from vcp import score, update_her_buffer
 
-tqdm.monitor_interval = 0  # its watching thread would outlive a run
-
-
-def variance_by_kind(agent: EnsembleDDPG, her_buffer: HERBuffer, most: int = 4096) -> dict:
-    """Figure 4: the mean variance of the critics NOW on the hindsight and the original transitions
-    of B_h or, without VCP, of what was drawn last; from about `most` of them, evenly spread."""
-    every = slice(None, her_buffer.size, max(1, her_buffer.size // most))
-    rows = {name: x[every] for name, x in her_buffer.data.items()}
-    variance = agent.q_variance(rows["obs"], rows["action"], rows["goal"])
-    kinds = {"hindsight": rows["hindsight"], "original": ~rows["hindsight"]}
-    return {
-        f"variance_{name}": float(variance[kind].mean()) if kind.any() else math.nan
-        for name, kind in kinds.items()
-    }
+# Step t, some of the N environments as a slice, their observations (n, O) and goals (n, G) ->
+# their actions (n, A) in [-1, 1]
+Policy = Callable[[int, slice, np.ndarray, np.ndarray], np.ndarray]
 
 
-@contextmanager
-def timed(seconds: dict[str, float], name: str):
-    """Add the wall time of the block to seconds[name]."""
-    start = time.perf_counter()
-    yield
-    seconds[name] += time.perf_counter() - start
-
-
-def make_agent(config: Config, env: gym.Env) -> EnsembleDDPG:
-    """Algorithm 2, line 1: the off-policy algorithm 𝔸, for an environment of `make_env`."""
-    return EnsembleDDPG(
-        obs_dim=env.observation_space["observation"].shape[0],
-        goal_dim=env.observation_space["desired_goal"].shape[0],
-        action_dim=env.action_space.shape[0],
-        heads=config.heads,
-        gamma=1 - 1 / env.spec.max_episode_steps,
-        learning_rate=config.learning_rate,
-        trunk_rate=config.trunk_rate,
-        polyak=config.polyak,
-        action_penalty=config.action_penalty,
-        device=config.device,
-        seed=config.seed,
-    )
-
-
-def make_replay(config: Config, env: gym.Env, original_buffer: EpisodeBuffer, reward_fn):
-    """What Algorithm 2, line 15, draws from: B_h, or the replay of another `--method`."""
-    drawn = config.updates * config.heads  # mini-batches in a cycle
-    if config.method == "vcp":
-        return HERBuffer(
-            capacity=config.her_buffer_capacity,
-            temperature=config.temperature,
-            priority=config.priority,
-            importance=config.importance,
-        )
-    her = (original_buffer, config.relabel_ratio, reward_fn)
-    at_once = max(n for n in range(1, 41) if drawn % n == 0)
-    if config.method == "her":
-        return HERReplay(*her, at_once=at_once)
-    from baselines import cher, dtgsh, herebp
-
-    common = {"env_name": config.env, "faithful": config.faithful, "at_once": at_once}
-    if config.method == "herebp":
-        return herebp.HEREBP(*her, **common, dt=getattr(env.unwrapped, "dt", 1.0))
-    if config.method == "cher":
-        return cher.CHER(*her, **common, heads=config.heads, updates=config.cycles * config.updates)
-    return dtgsh.DTGSH(*her, **common)
-
-
-@one_thread()
-@without_denormals()
+@numerics.for_training()
 def train(config: Config, resume: bool = False) -> list[dict]:
-    """Algorithm 2. Writes the run's folder and gives the rows of its progress.csv.
+    """Algorithm 2. Writes the run's folder and returns the rows of its progress.csv.
 
     resume: go on with the run in config.out, after its last whole epoch. Everything random follows
     from (seed, epoch), so the rows are those of a run that was never stopped.
     UsageError, before anything is written, for a config that cannot be run; FloatingPointError
     where NaN or Inf turns up.
     """
-    config = options.complete(config)
-    folder = Path(config.out)
-    env = make_env(config.env)
-    env.close()
-    horizon = env.spec.max_episode_steps  # T
-    heads, batch_size = config.heads, config.batch_size
-    # One environment a head; fewer than 16 heads have several each, for the paper's amount of data.
-    num_envs = heads * math.ceil(16 / heads)
+    config = complete(config)
+    its = assemble(config)  # 1: the off-policy algorithm 𝔸, B_o and B_h
+    agent, original_buffer, her_buffer = its.agent, its.original_buffer, its.her_buffer
+    heads, num_envs, horizon = config.heads, its.num_envs, its.task.horizon
+    acting = heads if config.acting_head == "all" else 1  # Section 5.6
+    noise_shape = (horizon, num_envs, its.task.action_dim)
     test_rounds = math.ceil(config.eval_episodes / num_envs)
 
-    # Line 1: the off-policy algorithm 𝔸, B_o and B_h
-    agent = make_agent(config, env)
-    dims = [env.observation_space[name].shape[0] for name in ("observation", "desired_goal")]
-    original_buffer = EpisodeBuffer(config.buffer_size, horizon, *dims, env.action_space.shape[0])
-
-    def reward_fn(achieved, desired):
-        return env.unwrapped.compute_reward(achieved, desired, {})  # Eq. (1)
-
-    her_buffer = make_replay(config, env, original_buffer, reward_fn)
-    vcp = config.method == "vcp"
-
-    def collect(random_actions):  # lines 3-11
-        acting = heads if config.acting_head == "all" else 1
-        policy = actor(agent, acting, num_envs)
-        shape = (horizon, num_envs, env.action_space.shape[0])
-        policy = explorer(policy, play_rng, shape, config.noise, random_actions)
-        episodes, success = rollout(envs, policy, horizon)
-        slots = original_buffer.add(episodes, play_rng)  # line 9
-        if not vcp:
-            her_buffer.new_episodes(slots)
-        # The normaliser sees what the networks will: relabelled goals too.
-        size = num_envs * horizon
-        seen = relabel_future(episodes, size, play_rng, config.relabel_ratio, reward_fn)
-        agent.normalizer.update(np.concatenate([seen["obs"], seen["goal"]], axis=1))
-        return success
-
-    scored = round(config.scored_per_drawn * heads * batch_size)  # by Algorithm 1, a sweep
-
-    rows, env_steps, start = [], 0, time.perf_counter()
-    parts = (agent, original_buffer, her_buffer)
-    saved = records.load_checkpoint(folder) if resume else None
-    if saved:
-        for part, state in zip(parts, saved["parts"], strict=True):
-            part.load_state_dict(state)
-        rows = saved["rows"]
-        env_steps, start = rows[-1]["env_steps"], start - rows[-1]["wall_seconds"]
-
-    with (
-        ParallelEnvs(config.env, num_envs, config.num_workers, heads) as envs,
-        ThreadPoolExecutor(1) as thread,
-        fast_products(),
-    ):
+    folder, began = Path(config.out), time.perf_counter()
+    rows = records.restore(folder, its.state()) if resume else []
+    began -= rows[-1]["wall_seconds"] if rows else 0
+    with its.envs() as envs, ThreadPoolExecutor(1) as thread:
         records.start(folder, asdict(config), rows, resume)
-        print(describe(config.env))
-        for epoch in range(len(rows) + 1, config.epochs + 1):  # line 2
+        print(its.task.made)
+        for epoch in range(len(rows) + 1, config.epochs + 1):  # 2: M epochs
             seeds = np.random.SeedSequence([config.seed, epoch])
             train_seed, test_seed = map(int, seeds.generate_state(2))
             play_rng, her_rng, draw_rng = map(np.random.default_rng, seeds.spawn(3))
-            seconds, successes, losses, originals = defaultdict(float), [], [], []
-            rounds = config.cycles + test_rounds
-            bar = tqdm(desc=f"epoch {epoch}", total=rounds, leave=False, disable=None)
-
+            relabelling = (her_rng, config.relabel_ratio, its.task.reward_fn)
+            notes = records.Notes(epoch, config.epochs, config.cycles + test_rounds)
             envs.reset(train_seed)
-            if epoch == 1:  # not in the paper: first an episode of random actions in each
-                collect(random_actions=1)
-                env_steps += num_envs * horizon
-            for _ in range(config.cycles):
-                with timed(seconds, "collect"):  # line 3, Data generation
-                    successes.append(collect(config.random_actions))
-                    env_steps += num_envs * horizon
-                with timed(seconds, "train"):  # line 12, Training
-                    relabelling = (her_rng, config.relabel_ratio, reward_fn)
-                    if vcp and not her_buffer.size:  # something to draw, once, of all there is
+            # + Appendix B: n cycles an epoch; VCP+: before the first one an episode at random in
+            # each environment, cycle 0, after which nothing is trained
+            for cycle in range(epoch > 1, config.cycles + 1):
+                with notes.timed("collect"):  # 3: data generation
+                    random_actions = config.random_actions if cycle else 1
+                    policy = greedy(agent, acting, num_envs)  # each head has its environments
+                    policy = exploring(policy, play_rng, noise_shape, config.noise, random_actions)
+                    episodes, success = rollout(
+                        envs, policy, horizon
+                    )  # 4-8, 10, 11: an episode each
+                    slots = original_buffer.add(episodes, play_rng)  # 9: into B_o
+                    # + HER+: the normaliser sees what the networks will, relabelled goals too
+                    size = num_envs * horizon
+                    seen = relabel_future(episodes, size, play_rng, *relabelling[1:])
+                    agent.normalizer.update(np.concatenate([seen["obs"], seen["goal"]], axis=1))
+                    if her_buffer is None:  # + another method's replay
+                        its.replay.new_episodes(slots)
+                if not cycle:
+                    continue
+                notes.successes.append(success)
+
+                with notes.timed("train"):  # 12: training
+                    if her_buffer and not her_buffer.size:
+                        # + so that there is something to draw: once, as much as B_o holds
                         first = min(original_buffer.size * horizon, her_buffer.capacity)
-                        its = (original_buffer, her_buffer, agent.q_variance)
-                        update_her_buffer(*its, first, *relabelling)
-                    for _ in range(config.updates):
-                        if vcp:  # line 13: Algorithm 1, its lines 3-5, in another thread
-                            its = (original_buffer, agent.frozen_q_variance())
-                            scoring = thread.submit(score, *its, scored, *relabelling)
-                        for k in range(heads):  # line 14
-                            batch = her_buffer.sample(batch_size, draw_rng)  # line 15
-                            losses.append(agent.update_head(k, batch))  # line 16
-                            originals.append(1 - batch["hindsight"].mean())
-                        if vcp:  # both are done: Algorithm 1, lines 6-7
-                            her_buffer.add(*scoring.result())
+                        scoring = (original_buffer, her_buffer, agent.q_variance, first)
+                        update_her_buffer(*scoring, *relabelling)
+                    for _ in range(config.updates):  # + VCP+: 5 or 40 sweeps of the heads a cycle
+                        if her_buffer:  # 13: in another thread, Algorithm 1, its lines 3-5
+                            scoring = (agent.frozen_q_variance(), scored_a_sweep(config))
+                            scored = thread.submit(score, original_buffer, *scoring, *relabelling)
+                        for k in range(heads):  # 14: the heads in turn
+                            batch = its.replay.sample(config.batch_size, draw_rng)  # 15: from B_h
+                            notes.losses.append(agent.update_head(k, batch))  # 16: 𝔸 on head k
+                            notes.originals.append(1 - batch["hindsight"].mean())
+                        if her_buffer:  # 17: both are done; Algorithm 1, its lines 6-7
+                            her_buffer.add(*scored.result())
                             her_buffer.update_priorities()
-                    agent.update_targets()
-                bar.update()
-            with timed(seconds, "eval"):
-                envs.reset(test_seed)
-                test = evaluate(envs, agent, heads, horizon, test_rounds, bar)
-            bar.close()
+                    agent.update_targets()  # + HER+: once a cycle
 
-            critic_loss, actor_loss = torch.stack(losses).mean(dim=0).tolist()
-            if not math.isfinite(critic_loss + actor_loss):
-                raise FloatingPointError(f"NaN or Inf in the losses of epoch {epoch}")
-            row = {
-                "epoch": epoch,
-                "env_steps": env_steps,
-                "wall_seconds": time.perf_counter() - start,
-                "train_success_rate": float(np.mean(successes)),
-                **test,
-                "critic_loss": critic_loss,
-                "actor_loss": actor_loss,
-                **variance_by_kind(agent, her_buffer),
-                "batch_original_fraction": float(np.mean(originals)),
-                "her_buffer_size": her_buffer.size,
-                **{f"{name}_seconds": value for name, value in seconds.items()},
-            }
-            rows.append(row)
-            records.save_checkpoint(
-                folder, {"rows": rows, "parts": [p.state_dict() for p in parts]}
-            )
-            records.write_rows(folder, rows)
-            if config.tensorboard:
-                records.add_to_tensorboard(folder, row)
-            tqdm.write(
-                "epoch {epoch:3d}  steps {env_steps:7d}  test success {test_success_rate:.3f}  "
-                "train success {train_success_rate:.3f}  Q {test_q:6.2f}  "
-                "{wall_seconds:.0f} s".format(**row)
-            )
-    return rows
+            envs.reset(test_seed)  # + Section 5.1
+            tests = []
+            for _ in range(test_rounds):
+                with notes.timed("eval"):
+                    tests.append(evaluate(envs, agent, heads, horizon))
+            test = tuple(float(np.mean(part)) for part in zip(*tests, strict=True))
+            env_steps = num_envs * horizon * (epoch * config.cycles + 1)
+            rows.append(notes.row(env_steps, test, agent, its.replay, began))
+            records.save(folder, asdict(config), rows, its.state())
+            notes.write(rows[-1])
+    return rows  # 18
 
 
-def main(argv: list[str] | None = None) -> None:
-    """The command line. Exit code 2 and one line for bad input, 1 and one line for a run that
-    something outside the program stopped, 130 for Ctrl-C."""
-    given, command = options.parse(argv)
-    try:
-        if command.play:
-            from play import play  # it imports this module
+# ------------------------------------------------------------------------------ lines 4-11
 
-            play(Path(command.play), command.gif)
-            return
-        config = Config(**given)
-        if command.resume:
-            saved = options.load(Path(command.resume))
-            config = options.changed(saved, {**given, "out": command.resume})
-        config = options.complete(config)
-        try:
-            train(config, resume=bool(command.resume))
-        except (FloatingPointError, OSError, KeyboardInterrupt) as error:
-            epoch = records.epochs_done(Path(config.out)) + 1
-            reason = f": {error}" if str(error) else ""
-            print(f"run.py: stopped in epoch {epoch}{reason}", file=sys.stderr, end="; ")
-            print(f"to go on: python run.py --resume {config.out}", file=sys.stderr)
-            sys.exit(130 if isinstance(error, KeyboardInterrupt) else 1)
-    except UsageError as error:
-        options.fail(str(error))
-    except KeyboardInterrupt:  # while it plays
-        sys.exit(130)
+
+def rollout(envs: ParallelEnvs, policy: Policy, horizon: int) -> tuple[dict, np.ndarray]:
+    """Algorithm 2, lines 4-11: an episode in each environment, all at once.
+
+    Returns the episodes, with the arrays of her.EpisodeBuffer, and is_success at the last step,
+    (N,). The workers ask the policy at their own pace. FloatingPointError for a NaN or Inf.
+    """
+    with numerics.small_calls():
+        parts = envs.each(partial(episodes_of, policy=policy, horizon=horizon))
+    parts, successes = zip(*parts, strict=True)
+    episodes = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    for name, array in episodes.items():
+        if not np.isfinite(array).all():
+            raise FloatingPointError(f"NaN or Inf in the {name} of an episode")
+    return episodes, np.concatenate(successes)
+
+
+def episodes_of(worker: Worker, policy: Policy, horizon: int) -> tuple[dict, np.ndarray]:
+    """`rollout` for the environments of one worker."""
+    steps, actions = [worker.reset()], []  # 5: goals and initial states
+    goal = steps[0]["desired_goal"]
+    for t in range(horizon):  # 6: T steps
+        actions.append(np.float32(policy(t, worker.rows, steps[-1]["observation"], goal)))  # 7: a_t
+        obs, success = worker.step(actions[-1])  # 8: s_{t+1}; Eq. (1) gives r_t when it is needed
+        steps.append(obs)
+    episodes = {
+        "obs": np.stack([obs["observation"] for obs in steps], axis=1),  # (n, T+1, O)
+        "achieved_goal": np.stack([obs["achieved_goal"] for obs in steps], axis=1),
+        "desired_goal": goal,  # (n, G)
+        "action": np.stack(actions, axis=1),  # (n, T, A)
+    }
+    return episodes, success
+
+
+def by_head(rows: np.ndarray, heads: int) -> np.ndarray:
+    """(N, ..., D) -> (heads, -1, D): the first N/heads environments are head 0's, and so on."""
+    return rows.reshape(heads, -1, rows.shape[-1])
+
+
+def greedy(agent: EnsembleDDPG, heads: int, num_envs: int) -> Policy:
+    """μ_k without noise, of the first `heads` heads, which share the environments evenly."""
+
+    def act(t, rows, obs, goal):
+        k = slice(rows.start * heads // num_envs, math.ceil(rows.stop * heads / num_envs))
+        action = agent.act(by_head(obs, k.stop - k.start), by_head(goal, k.stop - k.start), k)
+        return action.reshape(len(obs), -1)
+
+    return act
+
+
+def exploring(
+    policy: Policy, rng: np.random.Generator, shape, noise: float, random_actions: float
+) -> Policy:
+    """π_k: `policy` with HER's exploration (not in the paper): Gaussian noise, then some actions
+    uniform instead. shape: (T, N, A) of all that is drawn for an episode in each environment."""
+    gaussian = noise * rng.standard_normal(shape)
+    uniform = rng.uniform(-1, 1, shape)
+    instead = rng.random((*shape[:2], 1)) < random_actions
+
+    def act(t, rows, obs, goal):
+        noisy = np.clip(policy(t, rows, obs, goal) + gaussian[t, rows], -1, 1)
+        return np.where(instead[t, rows], uniform[t, rows], noisy)
+
+    return act
+
+
+def evaluate(
+    envs: ParallelEnvs, agent: EnsembleDDPG, heads: int, horizon: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Section 5.1: an episode in each environment, by all heads, without noise. Returns
+    is_success (N,), and Q_k(s, μ_k(s, g), g) of all steps, (K, ...)."""
+    episodes, success = rollout(envs, greedy(agent, heads, envs.num_envs), horizon)
+    obs = episodes["obs"][:, :-1]  # (N, T, O)
+    goal = np.repeat(episodes["desired_goal"][:, None], horizon, axis=1)  # (N, T, G)
+    return success, agent.value(by_head(obs, heads), by_head(goal, heads))
 
 
 if __name__ == "__main__":
-    main()
+    cli.main(train)

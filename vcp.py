@@ -24,8 +24,8 @@ def value_consistency_priority(
 ) -> np.ndarray:
     """Eq. (4) and its normalisation: the probabilities to draw each transition of B_h.
 
-    variance: (N,), σ²_i over the critics; temperature: 𝒯; eps: ε. Gives (N,) float64, summing to 1.
-    FloatingPointError if a variance is NaN or Inf.
+    variance: (N,), σ²_i over the critics; temperature: 𝒯; eps: ε. Returns (N,) float64, which add
+    up to 1. FloatingPointError if a variance is NaN or Inf.
 
     The sum inside Eq. (4) is the same for all i, so normalising cancels it, and any other common
     factor may stand in its place. Here it is the largest term: the ratios lie in (0, 1] and one of
@@ -76,19 +76,24 @@ class HERBuffer:
 
     def add(self, batch: Batch, variance: np.ndarray) -> None:
         """Algorithm 1, line 6: store the mini-batch over the oldest transitions.
-        Its arrays have B rows each, variance is (B,); ValueError if B exceeds the capacity."""
-        if len(variance) > self.capacity:
-            raise ValueError(f"{len(variance)} transitions do not fit into {self.capacity}")
-        batch = {**batch, "variance": variance}
+        batch: arrays or CPU tensors of B rows each; variance: (B,). ValueError for another shape or
+        for more than the capacity."""
+        batch = {name: np.asarray(x) for name, x in {**batch, "variance": variance}.items()}
+        rows = batch["variance"].shape
+        if len(rows) != 1 or any(x.shape[:1] != rows for x in batch.values()):
+            raise ValueError(f"the variance is {rows}, one number for each transition is needed")
+        if rows[0] > self.capacity:
+            raise ValueError(f"{rows[0]} transitions do not fit into {self.capacity}")
         if not self.data:
             self.data = {
                 name: np.empty((self.capacity, *x.shape[1:]), x.dtype) for name, x in batch.items()
             }
-        slots = (self._next + np.arange(len(variance))) % self.capacity
+        slots = (self._next + np.arange(*rows)) % self.capacity
         for name, x in batch.items():
             self.data[name][slots] = x
-        self._next = (self._next + len(variance)) % self.capacity
-        self.size = min(self.size + len(variance), self.capacity)
+        self._next = (self._next + rows[0]) % self.capacity
+        self.size = min(self.size + rows[0], self.capacity)
+        self.probabilities = np.empty(0)  # the older ones no longer hold
 
     def update_priorities(self) -> None:
         """Algorithm 1, line 7: Eq. (4) over all of B_h, from the stored variances. O(N)."""
@@ -98,7 +103,10 @@ class HERBuffer:
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
         """Algorithm 2, line 15: draw with replacement by the normalised priorities, O(log N) each.
-        Gives the stored arrays' rows and "weight" (B,) float32, the factor of each in the loss."""
+        Returns rows of the stored arrays and "weight" (B,) float32, the factor of each in the loss.
+        ValueError if `update_priorities` was not called since the last `add`."""
+        if not len(self.probabilities):
+            raise ValueError("B_h has no priorities: call update_priorities() after add()")
         # Inverse transform sampling: the first i with p_1 + ... + p_i > u.
         i = np.searchsorted(self._cumulative, rng.random(batch_size), side="right")
         batch = {name: x[i] for name, x in self.data.items()}

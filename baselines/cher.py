@@ -10,7 +10,8 @@ Letters in the shape comments:
 
 import numpy as np
 
-from her import Batch, HERReplay, future_goals, transitions
+from baselines.her import HERReplay
+from her import Batch, future_goals, transitions
 
 GROWTH = 1e-4  # of λ, with each update
 TRIO = 3  # candidates that are looked at for one to be taken
@@ -53,7 +54,7 @@ def select(
     selected: S, at most M - 2. proximity: λ for each mini-batch, (U,).
     faithful: a candidate that leads its trio for a moment and is then beaten counts as selected in
         the diversity from there on, as in the original: it has nothing to add any more.
-    Gives the chosen candidates, (U, S).
+    Returns the chosen candidates, (U, S).
     """
     sets, candidates = goal.shape[:2]
     gain = coverage(goal)

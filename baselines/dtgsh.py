@@ -12,7 +12,8 @@ Letters in the shape comments:
 import numpy as np
 import torch
 
-from her import Batch, HERReplay, future_goals, transitions
+from baselines.her import HERReplay
+from her import Batch, future_goals, transitions
 
 CANDIDATES = 100 / 64  # for each that is selected
 SMALLEST = 1e-12  # an eigenvalue's share of the largest; below it is rounding
@@ -62,7 +63,7 @@ def sample_k_dpp(
 ) -> np.ndarray:
     """Samples of k-DPPs: sets S of k different items with P(S) = det(L_S) / e_k(λ).
 
-    kernel: L, (U, M, M), symmetric and positive semidefinite. Gives (U, k), items of each set.
+    kernel: L, (U, M, M), symmetric and positive semidefinite. Returns (U, k), items of each set.
     faithful: always the eigenvectors of the k largest eigenvalues. The original's polynomials
         are zero in floating point for goals like Fetch's, which leaves it the first k.
     """

@@ -9,7 +9,8 @@ Letters in the shape comments:
 
 import numpy as np
 
-from her import Batch, HERReplay, future_goals, transitions
+from baselines.her import HERReplay
+from her import Batch, future_goals, transitions
 
 GRAVITY = 9.81  # m/s²; masses are 1 kg and moments of inertia 1 kg·m²
 MOST_PER_STEP = {"Fetch": 0.5, "Hand": 2.5}  # J; the original's README, by the environment's name

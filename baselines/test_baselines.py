@@ -8,16 +8,25 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-import options
 import run
 from baselines.cher import CHER, coverage, select
 from baselines.dtgsh import DTGSH, choose_eigenvectors, sample_k_dpp, trajectory_diversity
+from baselines.her import HERReplay
 from baselines.herebp import EPSILON, HEREBP, trajectory_energy
 from ensemble import EnsembleDDPG
-from envs_point import PAPER_ENVS, make_env
-from her import EpisodeBuffer, HERReplay
+from harness import settings
+from harness.assemble import make_replay
+from harness.tasks import PAPER_ENVS, examine
+from harness.testing import (
+    SMALL_TRAINING,
+    assert_frequencies,
+    exact_reward,
+    numbered_episodes,
+    without_timing,
+)
+from harness.workers import ParallelEnvs
+from her import EpisodeBuffer
 from run import Config, train
-from test_vcp import SMALL, assert_frequencies, exact_reward, numbered_episodes, without_timing
 from vcp import HERBuffer, update_her_buffer
 
 DT, G = 0.04, 9.81
@@ -473,25 +482,19 @@ def test_limits_of_the_originals():
 
 @pytest.mark.parametrize("name", PAPER_ENVS)
 def test_every_method_in_each_of_the_sixteen(name):
-    env = make_env(name)
-    obs, _ = env.reset(seed=0)
-    obs_dim, goal_dim = len(obs["observation"]), len(obs["desired_goal"])
-    action_dim, rng = env.action_space.shape[0], np.random.default_rng(0)
-    agent = EnsembleDDPG(obs_dim, goal_dim, action_dim, gamma=0.98, heads=1)
-    buffer = EpisodeBuffer(1000, 50, obs_dim, goal_dim, action_dim)
-    with run.ParallelEnvs(name, 2, 1) as envs:
+    task, rng = examine(name), np.random.default_rng(0)
+    dims = (task.obs_dim, task.goal_dim, task.action_dim)
+    agent = EnsembleDDPG(*dims, gamma=0.98, heads=1)
+    buffer = EpisodeBuffer(1000, 50, *dims)
+    with ParallelEnvs(name, 2, 1) as envs:
         envs.reset(0)
-        episodes, _ = run.rollout(envs, lambda *_: rng.uniform(-1, 1, (2, action_dim)), 50)
-
-    def reward_fn(achieved, desired):
-        return env.unwrapped.compute_reward(achieved, desired, {})
-
+        episodes, _ = run.rollout(envs, lambda *_: rng.uniform(-1, 1, (2, task.action_dim)), 50)
     slots = buffer.add(episodes, rng)
     for method in OTHERS:
         for faithful in (False, True):
-            config = options.complete(Config(env=name, method=method, updates=4, heads=1))
+            config = settings.complete(Config(env=name, method=method, updates=4, heads=1))
             config.faithful = faithful
-            replay = run.make_replay(config, env, buffer, reward_fn)
+            replay = make_replay(config, task, buffer)
             replay.new_episodes(slots)
             batch = replay.sample(64, rng)
             assert {x.shape[0] for x in batch.values()} == {64}
@@ -500,21 +503,21 @@ def test_every_method_in_each_of_the_sixteen(name):
             assert agent.update_head(0, batch).isfinite().all()
 
 
-def settings(method, heads, **others):
-    small = {**SMALL, "env": "PointMassEmptyEnv-v1", "num_workers": 1, **others}
+def tiny(method, heads, **others):
+    small = {**SMALL_TRAINING, "env": "PointMassEmptyEnv-v1", "num_workers": 1, **others}
     return {**small, "method": method, "heads": heads}
 
 
 @pytest.mark.parametrize("method", OTHERS)
 def test_the_smallest_mini_batches(method, tmp_path):
     least = 2 if method == "cher" else 1
-    train(Config(**settings(method, 1, batch_size=least), out=str(tmp_path / "run")))
+    train(Config(**tiny(method, 1, batch_size=least), out=str(tmp_path / "run")))
 
 
 @pytest.mark.parametrize("heads", [1, 16])
 @pytest.mark.parametrize("method", OTHERS)
 def test_a_run_of_every_method(method, heads, tmp_path):
-    (row,) = train(Config(**settings(method, heads), out=str(tmp_path / "run")))
+    (row,) = train(Config(**tiny(method, heads), out=str(tmp_path / "run")))
     assert all(math.isfinite(value) for value in row.values()), row
     assert row["env_steps"] == 3 * 16 * 50
     assert (row["variance_hindsight"] == 0) == (heads == 1)
@@ -522,7 +525,7 @@ def test_a_run_of_every_method(method, heads, tmp_path):
 
 @pytest.mark.parametrize("method", OTHERS)
 def test_a_resumed_run_of_every_method_equals_an_uninterrupted_one(method, tmp_path):
-    config = {**settings(method, 2), "epochs": 3, "eval_episodes": 4}
+    config = {**tiny(method, 2), "epochs": 3, "eval_episodes": 4}
     train(Config(**config, out=str(tmp_path / "whole")))
     train(Config(**{**config, "epochs": 2}, out=str(tmp_path / "parts")))
     train(Config(**config, out=str(tmp_path / "parts")), resume=True)
@@ -541,14 +544,14 @@ def test_the_heads_get_mini_batches_of_their_own(tmp_path, monkeypatch):
     monkeypatch.setattr(EnsembleDDPG, "update_head", spy)
     for method in OTHERS:
         batches.clear()
-        train(Config(**settings(method, 3), out=str(tmp_path / method)))
+        train(Config(**tiny(method, 3), out=str(tmp_path / method)))
         assert [k for k, _ in batches] == 2 * 2 * [0, 1, 2]
         assert len({b for _, b in batches}) == len(batches)
 
 
 def test_dtgsh_keeps_batch_64_and_the_amount_of_data():
     for env in PAPER_ENVS:
-        ours, theirs = (options.paper_schedule(env, m) for m in ("dtgsh", "her"))
+        ours, theirs = (settings.paper_schedule(env, m) for m in ("dtgsh", "her"))
         assert ours["batch_size"] == 64 and ours["cycles"] == theirs["cycles"]
         used = [s["batch_size"] * s["updates"] for s in (ours, theirs)]
         assert used[0] == used[1]

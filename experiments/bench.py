@@ -20,11 +20,13 @@ import torch
 
 import run
 from ensemble import HIDDEN, EnsembleDDPG
-from envs_point import make_env
+from harness.assemble import make_replay
+from harness.numerics import fast_products, one_thread
+from harness.settings import METHODS, Config, complete
+from harness.tasks import examine, make_env
+from harness.workers import ParallelEnvs, available_cores
 from her import EpisodeBuffer
-from options import METHODS, complete
 from vcp import score, update_her_buffer
-from workers import ParallelEnvs, available_cores, fast_products, one_thread
 
 SIZES = {"FetchReach-v1": (10, 3, 4), "FetchPush-v1": (25, 3, 4), "HandReach-v0": (63, 15, 20)}
 PAPER_MINUTES = {2: 3.2, 4: 5.6, 8: 8.5, 16: 12.0, 32: 20.7}  # Table 2, HandReach
@@ -137,7 +139,7 @@ def bench_collection(repeats: int, num_envs: int = 16, horizon: int = 50) -> Non
         raw_actions = rng.uniform(-1, 1, (horizon, action_dim)).astype(np.float32)
 
         def play(agent=agent, rng=rng, shape=(horizon, num_envs, action_dim)):
-            policy = run.explorer(run.actor(agent, 16, num_envs), rng, shape, 0.2, 0.3)
+            policy = run.exploring(run.greedy(agent, 16, num_envs), rng, shape, 0.2, 0.3)
             run.rollout(envs, policy, horizon)
 
         def raw(env=env, actions=raw_actions):
@@ -145,7 +147,7 @@ def bench_collection(repeats: int, num_envs: int = 16, horizon: int = 50) -> Non
             for action in actions:
                 env.step(action)
 
-        with ParallelEnvs(name, num_envs, heads=16) as envs:
+        with ParallelEnvs(name, num_envs, min(cores, 16)) as envs:
             envs.reset(0)
             t = in_turn({"play": play, "raw": raw}, repeats)
         rate, raw_rate = num_envs * horizon / t["play"], horizon / t["raw"]
@@ -171,14 +173,10 @@ def full_buffer(name: str, rng: np.random.Generator, transitions: int = 100_000)
     return buffer
 
 
-def replay_of(config: run.Config, original: EpisodeBuffer):
+def replay_of(config: Config, original: EpisodeBuffer):
     """What the run would draw from, and its reward function."""
-    env = make_env(config.env)
-
-    def reward_fn(achieved, desired):
-        return env.unwrapped.compute_reward(achieved, desired, {})
-
-    return run.make_replay(config, env, original, reward_fn), reward_fn
+    task = examine(config.env)
+    return make_replay(config, task, original), task.reward_fn
 
 
 @contextmanager
@@ -206,7 +204,7 @@ def bench_algorithm_1(repeats: int, heads: int = 16) -> None:
         size, rng = 256, np.random.default_rng(0)
         agent = EnsembleDDPG(*SIZES[name], gamma=0.98, heads=heads)
         original = full_buffer(name, rng)
-        her_buffer, reward_fn = replay_of(complete(run.Config(env=name, heads=heads)), original)
+        her_buffer, reward_fn = replay_of(complete(Config(env=name, heads=heads)), original)
         how = (heads * size, np.random.default_rng(1), 0.8, reward_fn)
         while her_buffer.size < her_buffer.capacity:
             update_her_buffer(original, her_buffer, agent.q_variance, *how)
@@ -241,9 +239,7 @@ def bench_algorithm_1(repeats: int, heads: int = 16) -> None:
 def cycle_seconds(cycles: int, **settings) -> dict[str, float]:
     """Seconds a cycle and an evaluation take, from a short real run."""
     with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as null:
-        config = run.Config(
-            **settings, epochs=1, cycles=cycles, eval_episodes=16, out=f"{folder}/run"
-        )
+        config = Config(**settings, epochs=1, cycles=cycles, eval_episodes=16, out=f"{folder}/run")
         with redirect_stdout(null):
             (row,) = run.train(config)
     # the warm-up is not in collect_seconds; evaluation here is a tenth of an epoch's
@@ -291,7 +287,7 @@ def bench_draws(repeats: int, heads: int = 16) -> None:
         for batch in (64, 256):
             replays, calls = {}, 40
             for method in METHODS[1:] if batch == 64 else METHODS[1:-1]:  # DTGSH: 64 alone
-                config = complete(run.Config(env=name, method=method, batch_size=batch))
+                config = complete(Config(env=name, method=method, batch_size=batch))
                 replays[method], _ = replay_of(config, original)
                 replays[method].new_episodes(np.arange(original.size))
             data = random_batch(batch, *SIZES[name])

@@ -9,19 +9,19 @@ import math
 import re
 import sys
 from collections import defaultdict
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-import options
-from experiments import variance_figures
-from options import Config
-from records import read_rows
+from experiments import didactic
+from experiments.didactic import RESULTS
+from harness import settings
+from harness.records import read_rows
+from harness.settings import Config
 
-RESULTS = Path(__file__).parent.parent / "results"
 # Okabe and Ito's colours, which colour-blind people can tell apart, and dashes for print
 COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"]
 DASHES = ["-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)), (0, (3, 1, 1, 1))]
@@ -41,14 +41,14 @@ def read_runs(folder: Path) -> list[Run]:
         rows = read_rows(file.parent)
         if rows:
             columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-            config = replace(options.load(file.parent), device="cpu", tensorboard=False)
-            runs.append(Run(options.complete(config), columns))
+            config = replace(settings.load(file.parent), device="cpu", tensorboard=False)
+            runs.append(Run(settings.complete(config), columns))
     return runs
 
 
 def paper_schedule(c: Config) -> tuple[int, int, int]:
     """Appendix B's cycles, updates and batch size."""
-    return tuple(options.paper_schedule(c.env, c.method).values())[:3]
+    return tuple(settings.paper_schedule(c.env, c.method).values())[:3]
 
 
 def as_many_updates(c: Config) -> bool:
@@ -58,11 +58,9 @@ def as_many_updates(c: Config) -> bool:
     return c.heads == 1 and same
 
 
-# Settings that the panel's title or the label's own words say, or that need no saying, as the
-# training does not depend on them or all seeds are one line.
+# Settings that the panel's title or the label's own words say, or that need no saying.
 SCHEDULE = ("cycles", "updates", "batch_size")
-SAID_ELSEWHERE = ("env", *SCHEDULE, "seed", "eval_episodes")
-SAID_ELSEWHERE += ("method", "heads", "priority", "acting_head", *options.MAY_CHANGE)
+SAID_ELSEWHERE = (*SCHEDULE, "eval_episodes", "heads", "priority", "acting_head")
 
 
 def label(c: Config) -> str:
@@ -76,13 +74,8 @@ def label(c: Config) -> str:
         parts.append(f"{c.priority} priority")
     if c.acting_head == "one":
         parts.append("one acting head")
-    default = options.complete(
-        Config(c.env, c.method, heads=c.heads, **{n: getattr(c, n) for n in SCHEDULE})
-    )
-    for name in (f.name for f in fields(Config) if f.name not in SAID_ELSEWHERE):
-        if getattr(c, name) != getattr(default, name):
-            parts.append(f"{name} {getattr(c, name)}")
-    return ", ".join(parts)
+    others = settings.differences(c).items()
+    return ", ".join(parts + [f"{name} {x}" for name, x in others if name not in SAID_ELSEWHERE])
 
 
 ABLATIONS = ("VCP", "VCP, uniform priority", "VCP, variance priority", "VCP, one acting head")
@@ -257,14 +250,13 @@ def from_arrays(name: str, folder: Path) -> Figure:
         return dict(np.load(folder / f"{stem}.npz"))
 
     if name == "fig3":
-        return variance_figures.figure_3(load("fig3"))
+        return didactic.draw_figure_3(load("fig3"))
     if name == "fig5":
-        names = variance_figures.PRIORITIES
-        return variance_figures.figure_5({p: load(f"fig5_{p}") for p in names})
+        return didactic.draw_figure_5({p: load(f"fig5_{p}") for p in didactic.PRIORITIES})
     sizes = [int(file.stem.removeprefix("fig8_")) for file in folder.glob("fig8_*.npz")]
     if not sizes:
         raise FileNotFoundError(folder / "fig8_*.npz")
-    return variance_figures.figure_8({k: load(f"fig8_{k}") for k in sizes})
+    return didactic.draw_figure_8({k: load(f"fig8_{k}") for k in sizes})
 
 
 def draw(name: str, results: Path = RESULTS, smooth: float = 0.0) -> Path:

@@ -3,9 +3,9 @@
     python -m experiments.sweep --env FetchReach-v1 Reacher-v2 --seeds 0-4 \\
         --variants "" priority=uniform method=her,heads=1 --set epochs=20
 
-A variant is a list of settings (the fields of options.Config), "" the defaults; --set goes for all
-runs. A run is in OUT/<env>/<variant>/seed<s>. Finished ones are skipped and broken ones resumed, so
-the same command goes on where it was stopped.
+A variant is a list of settings (the fields of harness.settings.Config), "" the defaults; --set goes
+for all runs. A run is in OUT/<env>/<its method and what differs>/seed<s>. Finished ones are skipped
+and broken ones resumed, so the same command goes on where it was stopped.
 """
 
 import argparse
@@ -17,14 +17,16 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-import options
-import records
 import run
-from envs_point import UsageError, make_env
-from options import Config
+from harness import records
+from harness import settings as options
+from harness.errors import UsageError
+from harness.settings import Config
+from harness.tasks import make_env
 
 ROOT = Path(__file__).parent.parent
-TYPES = {f.name: options.kind(f) for f in fields(Config)}
+OF_THE_SWEEP = ("env", "seed", "out")
+TYPES = {f.name: options.kind(f) for f in fields(Config) if f.name not in OF_THE_SWEEP}
 BOOLS = {"True": True, "False": False}
 
 
@@ -58,10 +60,13 @@ def all_runs(
         for env in envs:
             for variant in variants:
                 given = {**common, **settings(variant)}
-                name = variant.replace("=", "-").replace(",", "_") or given.get("method", "vcp")
-                folder = Path(out, env, name)
-                config = Config(**given, env=env, seed=seed, out=str(folder / f"seed{seed}"))
-                runs.append(options.complete(config))
+                config = options.complete(Config(**given, env=env, seed=seed, out=""))
+                config.out = str(Path(out, options.default_folder(config)))
+                runs.append(config)
+    folders = [config.out for config in runs]
+    for folder in folders:
+        if folders.count(folder) > 1:
+            raise UsageError(f"two runs are the same: {folder}")
     for env in envs:
         make_env(env).close()
     return runs

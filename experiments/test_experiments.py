@@ -5,31 +5,23 @@ import importlib.util
 import json
 import sys
 from dataclasses import asdict
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-import options
 from ensemble import MultiHeadMLP, linear
-from envs_point import UsageError, make_env
-from experiments import (
-    didactic,
-    effective,
-    figures,
-    plasticity,
-    replayed,
-    sweep,
-    variance_figures,
-)
-from experiments.checkpoints import restored
+from experiments import didactic, figures, inspect_run, sweep
+from harness import settings
+from harness.assemble import restored
+from harness.errors import UsageError
+from harness.records import COLUMNS, epochs_done, load_checkpoint
+from harness.settings import METHODS, Config
+from harness.tasks import examine
+from harness.testing import without_timing
 from her import EpisodeBuffer
-from options import METHODS, Config
-from records import COLUMNS, epochs_done, load_checkpoint
 from run import train
-from test_vcp import without_timing
 from vcp import value_consistency_priority
 
 SMALL = "epochs=2,cycles=1,updates=1,batch_size=16,eval_episodes=16"
@@ -38,7 +30,7 @@ SMALL = "epochs=2,cycles=1,updates=1,batch_size=16,eval_episodes=16"
 def make_run(folder, epochs=6, level=1.0, of=None, **settings):
     """A run's files, in which the success rises by `level` to 1 at most. of: all its epochs, for a
     run that was stopped before."""
-    config = options.complete(Config(**settings, epochs=of or epochs or 1))
+    config = settings.complete(Config(**settings, epochs=of or epochs or 1))
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps({"config": asdict(config)}))
     with open(folder / "progress.csv", "w", newline="") as file:
@@ -62,11 +54,11 @@ def results(tmp_path):
         "other": {"temperature": 1.0},
         **{f"{m}{k}": {"method": m, "heads": k} for m in figures.BASELINES for k in (1, 16)},
     }
-    for name, settings in variants.items():
+    for name, given in variants.items():
         for env in ("FetchReach-v1", "Reacher-v2"):
             for seed in range(2):
                 folder = tmp_path / env / name / f"seed{seed}"
-                make_run(folder, epochs=6 + seed, env=env, seed=seed, **settings)
+                make_run(folder, epochs=6 + seed, env=env, seed=seed, **given)
     make_run(tmp_path / "small", env="FetchReach-v1", updates=2)
     make_run(tmp_path / "just-begun", epochs=0, env="FetchReach-v1")
     make_run(tmp_path / "stopped", epochs=2, of=6, env="Reacher-v2", trunk_rate=0.5)
@@ -122,7 +114,7 @@ def test_each_figure_has_its_runs(name, lines, results, monkeypatch):
     ],
 )
 def test_the_label_names_what_is_not_the_default(settings, label):
-    assert figures.label(options.complete(Config(**settings))) == label
+    assert figures.label(settings.complete(Config(**settings))) == label
 
 
 def test_figure_4(results):
@@ -136,8 +128,7 @@ def test_the_figures_of_variances(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(didactic, "EPOCH", 1)
     monkeypatch.setattr(didactic, "SIZES", (2, 4))
     monkeypatch.setattr(didactic, "SHOWN", 40)
-    for module in (didactic, variance_figures):
-        monkeypatch.setattr(module, "STAGES", (1, 2))
+    monkeypatch.setattr(didactic, "STAGES", (1, 2))
     monkeypatch.setattr(didactic, "RESULTS", tmp_path)
     monkeypatch.setattr(sys, "argv", ["didactic", "--out", str(tmp_path / "runs")])
     didactic.main()
@@ -162,7 +153,7 @@ def test_the_correlation_with_the_distance():
     xy = np.stack([np.linspace(0, 1, 9) ** 2, np.zeros(9)], axis=1)[None].repeat(2, axis=0)
     distance = np.linalg.norm(xy - xy[:, [3]], axis=-1)
     variance = np.stack([distance[0] ** 3, -distance[1]])
-    r = variance_figures.distance_correlation({"xy": xy, "t": [3, 3], "variance": variance})
+    r = didactic.distance_correlation({"xy": xy, "t": [3, 3], "variance": variance})
     np.testing.assert_allclose(r, [1, -1])
 
 
@@ -170,19 +161,19 @@ def test_figure_8_says_how_often_originals_are_drawn():
     hindsight, p = np.array([True, True, True, False]), np.array([0.1, 0.2, 0.3, 0.4])
     variance = np.array([1.0, 2, 3, 4])
     data = {"variance": variance, "probability": p, "hindsight": hindsight}
-    fig = variance_figures.figure_8({2: data})
+    fig = didactic.draw_figure_8({2: data})
     assert fig.axes[0].get_title() == "originals: 25.0% of B_h, 40.0% of the draws"
 
 
 def test_the_effective_sample_size(tmp_path, capsys):
-    assert effective.effective_share(value_consistency_priority(np.full(50, 3.0), 9)) == (
+    assert inspect_run.effective_share(value_consistency_priority(np.full(50, 3.0), 9)) == (
         pytest.approx(1)
     )
     # σ² = 0 and 1 with 𝒯 = 1: p = 1 and ε / (1 + ε), so one of two is always drawn
     one = value_consistency_priority(np.array([0.0, 1.0]), 1)
-    assert effective.effective_share(one) == pytest.approx(0.5, abs=1e-5)
+    assert inspect_run.effective_share(one) == pytest.approx(0.5, abs=1e-5)
     sweep.main(arguments(tmp_path, "--task", "0"))
-    effective.main([str(tmp_path / "PointMassEmptyEnv-v1" / "vcp" / "seed0")])
+    inspect_run.main(["effective", str(folder_of(tmp_path))])
     line = capsys.readouterr().out.splitlines()[-1].split(" | ")
     shares = [float(x.rstrip("% |")) for x in line[2:]]
     assert line[1] == "2" and len(shares) == 5 and shares == sorted(shares, reverse=True)
@@ -190,7 +181,8 @@ def test_the_effective_sample_size(tmp_path, capsys):
 
 def test_what_each_method_replays(tmp_path, capsys):
     """Half of the episodes stand still; in the others each step leads out of the threshold, so that
-    r = 0 for t' = t + 1 alone, on average over t for H_T / T of the hindsight."""
+    r = 0 for t' = t + 1 alone, on average over t for H_T / T of the hindsight. Originals are never
+    at their goal."""
     horizon = 50
     ahead = 1 - np.sum(1 / np.arange(1, horizon + 1)) / horizon
     original = EpisodeBuffer(10_000, horizon, 2, 2, 2)
@@ -198,50 +190,64 @@ def test_what_each_method_replays(tmp_path, capsys):
     xy[100:] = np.arange(horizon + 1)[:, None]
     episodes = {"obs": xy, "achieved_goal": xy, "desired_goal": xy[:, 0] - 1}
     original.add({**episodes, "action": np.zeros((200, horizon, 2))}, np.random.default_rng(0))
-    env = make_env("PointMassEmptyEnv-v1")
-    reward_fn = partial(env.unwrapped.compute_reward, info={})
 
     def far(obs, action, goal):  # of the variance 1, what is near of 0
         return (np.linalg.norm(obs - goal, axis=1) > 2).astype(float)
 
+    def share(its, method):
+        return inspect_run.shares(inspect_run.drawn(its, method, np.random.default_rng(0)))
+
     config, agent = Config(env="PointMassEmptyEnv-v1"), SimpleNamespace(q_variance=far)
-    its = SimpleNamespace(config=config, env=env, reward_fn=reward_fn, agent=agent)
-    its.original = original
-    share = {m: replayed.share_ahead(its, m, np.random.default_rng(0)) for m in METHODS}
-    assert share["her"] == pytest.approx(ahead / 2, abs=0.02)
-    assert share["herebp"] == pytest.approx(ahead, abs=0.02)
-    assert share["vcp"] == 0  # nothing far is drawn
+    task = examine(config.env)
+    its = SimpleNamespace(config=config, task=task, agent=agent, original_buffer=original)
+    x = {method: share(its, method) for method in METHODS}
+    for method, expected in (("her", ahead / 2), ("herebp", ahead)):
+        assert x[method]["originals"] == pytest.approx(0.2, abs=0.02)
+        assert x[method]["ahead"] == pytest.approx(0.2 + 0.8 * expected, abs=0.02)
+    # nothing far is drawn: originals are as near as (-1, -1), and all their draws are ahead
+    assert x["vcp"]["ahead"] == pytest.approx(x["vcp"]["originals"], abs=0.02)
     its.config = Config(env=config.env, heads=1)
-    assert np.isnan(replayed.share_ahead(its, "vcp", np.random.default_rng(0)))
+    assert inspect_run.replayed(its)[0] == ""
 
     sweep.main(arguments(tmp_path, "--task", "0"))
-    folder = tmp_path / "PointMassEmptyEnv-v1" / "vcp" / "seed0"
-    whole, saved = restored(folder), load_checkpoint(folder)["parts"]
-    for part, state in zip((whole.agent, whole.original, whole.replay), saved, strict=True):
+    folder = folder_of(tmp_path)
+    (whole, _), saved = restored(folder), load_checkpoint(folder)["parts"]
+    for part, state in zip(whole.state(), saved, strict=True):
         torch.testing.assert_close(part.state_dict(), state, rtol=0, atol=0)
-    replayed.main([str(folder)])
+    inspect_run.main(["replayed", str(folder)])
     line = capsys.readouterr().out.splitlines()[-1].split(" | ")
-    assert line[1] == "2" and all(0 < float(x.rstrip("% |")) < 100 for x in line[2:])
-    with pytest.raises(UsageError, match="no run with a whole epoch"):
+    assert line[1] == "2" and len(line) == 2 + len(METHODS)
+    with pytest.raises(SystemExit):
         make_run(tmp_path / "begun", epochs=0)
-        replayed.main([str(tmp_path / "begun")])
+        inspect_run.main(["replayed", str(tmp_path / "begun")])
+    assert "no whole epoch" in capsys.readouterr().err
+
+
+def test_the_shares_by_weight():
+    batch = {
+        "hindsight": np.array([True, True, False, False]),
+        "reward": np.array([-1.0, 0, 0, -1]),
+        "weight": np.array([0.5, 0.5, 1, 2]),
+    }
+    by_hand = {"originals": 0.5, "originals weighted": 0.75, "ahead": 0.5, "ahead weighted": 0.625}
+    assert inspect_run.shares(batch) == by_hand
 
 
 def test_dead_units(tmp_path, capsys):
     net = MultiHeadMLP(3, 2, 2, torch.tanh, torch.Generator().manual_seed(0))
     net.heads[1][0, :64] = -1e6  # a quarter of one of two heads
     net.trunk[3][:32] = -1e6
-    embedding, units = plasticity.hidden(net, torch.randn(50, 3))
+    embedding, units = inspect_run.hidden(net, torch.randn(50, 3))
     assert embedding.shape == (1, 50, 256) and units.shape == (2, 50, 256)
     assert (embedding[..., :32] == 0).all() and (units[0, :, :64] == 0).all()
     x = torch.randn(50, 3)
-    outputs = torch.tanh(linear(plasticity.hidden(net, x)[1], *net.heads[2:]))
-    torch.testing.assert_close(outputs, net.forward_heads(x))
+    outputs = torch.tanh(linear(inspect_run.hidden(net, x)[1], *net.heads[2:]))
+    torch.testing.assert_close(outputs, net.all_heads(x))
     units = torch.zeros(2, 5, 4)
     units[0, 3, 1] = units[1, :, 2] = 0.1  # alive: one of four in each head
-    assert plasticity.dead_share(units) == 0.75
+    assert inspect_run.dead_share(units) == 0.75
     sweep.main(arguments(tmp_path, "--task", "0"))
-    plasticity.main([str(tmp_path / "PointMassEmptyEnv-v1" / "vcp" / "seed0")])
+    inspect_run.main(["dead", str(folder_of(tmp_path))])
     line = capsys.readouterr().out.splitlines()[-1].split(" | ")
     assert line[1] == "2" and all(0 <= int(x.rstrip("% |")) <= 100 for x in line[2:])
 
@@ -252,7 +258,7 @@ def test_the_trunk_outlives_the_first_cycle(tmp_path, capsys):
     trunk are dead after 40 updates (NOTES.md, "the trunks' Adam")."""
     settings = {"env": "FetchPush-v1", "epochs": 1, "cycles": 1, "batch_size": 64, "trunk_rate": 1}
     train(Config(**settings, eval_episodes=16, num_workers=1, out=str(tmp_path)))
-    plasticity.main([str(tmp_path)])
+    inspect_run.main(["dead", str(tmp_path)])
     line = capsys.readouterr().out.splitlines()[-1].split(" | ")
     assert line[1] == "1" and int(line[2].rstrip("%")) < 30
 
@@ -309,8 +315,7 @@ def test_what_a_sweep_consists_of(tmp_path):
     assert [c.seed for c in runs] == 3 * [0] + 3 * [1] + 3 * [7]
     folders = [c.out.removeprefix(str(tmp_path)) for c in runs[:3]]
     assert folders == [
-        f"/FetchReach-v1/{name}/seed0"
-        for name in ("vcp", "method-her_heads-1", "relabel_ratio-0.5")
+        f"/FetchReach-v1/{name}/seed0" for name in ("vcp", "her_heads-1", "vcp_relabel_ratio-0.5")
     ]
     assert (runs[1].method, runs[1].heads, runs[1].epochs) == ("her", 1, 20)
     assert sweep.settings("faithful=True,temperature=5") == {
@@ -342,6 +347,12 @@ def test_a_sweep_of_what_cannot_be_run_is_refused(wrong, capsys):
         sweep.all_runs(["Nowhere-v0"], [""], [0], {}, sweep.Path("runs"))
 
 
+def folder_of(root, seed=0, **settings_of):
+    """Where a sweep over SMALL has its run."""
+    given = {**sweep.settings(SMALL), "env": "PointMassEmptyEnv-v1", "seed": seed, **settings_of}
+    return root / settings.default_folder(settings.complete(Config(**given)))
+
+
 def arguments(folder, *others):
     its = ["--env", "PointMassEmptyEnv-v1", "--variants", "", "priority=uniform", "--set", SMALL]
     return [*its, "--out", str(folder), *others]
@@ -351,13 +362,13 @@ def test_a_task_of_a_sweep_is_skipped_done_or_gone_on_with(tmp_path, capsys):
     """What a SLURM array does, without Ray."""
     for task in (0, 1):
         sweep.main(arguments(tmp_path / "a", "--task", str(task)))
-    whole = tmp_path / "a" / "PointMassEmptyEnv-v1" / "priority-uniform" / "seed0"
+    whole = folder_of(tmp_path / "a", priority="uniform")
     assert epochs_done(whole) == 2
     stopped = [SMALL.replace("epochs=2", "epochs=1") if x == SMALL else x for x in arguments("b")]
     stopped[stopped.index("b")] = str(tmp_path / "b")
     sweep.main([*stopped, "--task", "1"])
     sweep.main(arguments(tmp_path / "b", "--task", "1"))
-    resumed = tmp_path / "b" / "PointMassEmptyEnv-v1" / "priority-uniform" / "seed0"
+    resumed = folder_of(tmp_path / "b", priority="uniform")
     assert without_timing(resumed) == without_timing(whole)
     before = (resumed / "progress.csv").read_bytes()
     sweep.main(arguments(tmp_path / "b", "--task", "1"))
@@ -370,12 +381,12 @@ def test_a_task_of_a_sweep_is_skipped_done_or_gone_on_with(tmp_path, capsys):
 @pytest.mark.slow
 def test_a_sweep_in_ray(tmp_path, capsys):
     pytest.importorskip("ray", reason="requirements-experiments.txt is not installed")
-    broken = tmp_path / "PointMassEmptyEnv-v1" / "priority-uniform" / "seed1"
+    broken = folder_of(tmp_path, seed=1, priority="uniform")
     make_run(broken, epochs=1, env="PointMassEmptyEnv-v1", seed=1)  # with other settings
     with pytest.raises(SystemExit) as stop:
         sweep.main(arguments(tmp_path, "--seeds", "0-1"))
     out = capsys.readouterr().out
     assert stop.value.code == 1 and "3 of 4 runs are whole" in out
     assert f"FAILED {broken}: " in out and "was made with" in out
-    assert epochs_done(tmp_path / "PointMassEmptyEnv-v1" / "vcp" / "seed1") == 2
+    assert epochs_done(folder_of(tmp_path, seed=1)) == 2
     assert "ray" in sys.modules

@@ -8,17 +8,23 @@ stands in the folder is whole: the last epoch's or the one before.
 import csv
 import io
 import json
+import math
 import os
 import pickle
 import platform
 import subprocess
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import torch
-from matplotlib.figure import Figure
+from tqdm.auto import tqdm
 
-from envs_point import UsageError
+from harness.errors import UsageError
 
 COLUMNS = [
     "epoch",
@@ -40,7 +46,79 @@ COLUMNS = [
 TIMING_COLUMNS = {name for name in COLUMNS if name.endswith("_seconds")}
 PACKAGES = ("numpy", "torch", "gymnasium", "gymnasium-robotics", "mujoco")
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
-FORMAT = 2  # of checkpoints; those without it have an Adam for each head, and are refused
+FORMAT = 3  # of checkpoints; others are refused
+
+tqdm.monitor_interval = 0  # its watching thread would outlive a run
+
+
+# ------------------------------------------------------------------------------ an epoch
+
+
+class Notes:
+    """What an epoch's row of progress.csv is made from, and the bar that shows how far it is."""
+
+    def __init__(self, epoch: int, epochs: int, rounds: int):
+        self.epoch, self.epochs = epoch, epochs
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.successes: list[np.ndarray] = []  # of training episodes, (N,) a cycle
+        self.losses: list[torch.Tensor] = []  # of critic and actor, (2,) an update
+        self.originals: list[float] = []  # their share in each mini-batch
+        # disable=None: no bar where the output is not a terminal
+        self.bar = tqdm(desc=f"epoch {epoch}/{epochs}", total=rounds, leave=False, disable=None)
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Add the wall time of the block to `seconds`, and a step to the bar."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] += time.perf_counter() - start
+        self.bar.update()
+
+    def row(self, env_steps: int, test: tuple[float, float], agent, replay, began: float) -> dict:
+        """The row. test: success rate and mean Q. FloatingPointError for NaN or Inf in a loss."""
+        self.bar.close()
+        critic_loss, actor_loss = torch.stack(self.losses).mean(dim=0).tolist()
+        if not math.isfinite(critic_loss + actor_loss):
+            raise FloatingPointError(f"NaN or Inf in the losses of epoch {self.epoch}")
+        return {
+            "epoch": self.epoch,
+            "env_steps": env_steps,
+            "wall_seconds": time.perf_counter() - began,
+            "test_success_rate": test[0],
+            "train_success_rate": float(np.mean(self.successes)),
+            "test_q": test[1],
+            "critic_loss": critic_loss,
+            "actor_loss": actor_loss,
+            **variance_by_kind(agent, replay),
+            "batch_original_fraction": float(np.mean(self.originals)),
+            "her_buffer_size": replay.size,
+            **{f"{name}_seconds": value for name, value in self.seconds.items()},
+        }
+
+    def write(self, row: dict) -> None:
+        """Print the row in fewer than 80 columns."""
+        tqdm.write(
+            f"epoch {self.epoch:{len(str(self.epochs))}}/{self.epochs}  {row['env_steps']:7d} steps"
+            f"  success {row['test_success_rate']:.3f} (training {row['train_success_rate']:.3f})"
+            f"  {row['wall_seconds']:.0f} s"
+        )
+
+
+def variance_by_kind(agent, replay, most: int = 4096) -> dict[str, float]:
+    """Figure 4: the mean variance of the critics as they are on the hindsight and the original
+    transitions of B_h or, without VCP, of what was drawn last; from about `most` of them, evenly
+    spread."""
+    every = slice(None, replay.size, max(1, replay.size // most))
+    rows = {name: x[every] for name, x in replay.data.items()}
+    variance = agent.q_variance(rows["obs"], rows["action"], rows["goal"])
+    kinds = {"hindsight": rows["hindsight"], "original": ~rows["hindsight"]}
+    return {
+        f"variance_{name}": float(variance[kind].mean()) if kind.any() else math.nan
+        for name, kind in kinds.items()
+    }
+
+
+# ------------------------------------------------------------------------------ the folder
 
 
 def write_whole(path: Path, write) -> None:
@@ -68,7 +146,7 @@ def read_config(folder: Path) -> dict:
     """The settings of the run in `folder`. UsageError if there is none."""
     try:
         return json.loads((folder / "config.json").read_text())["config"]
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{folder} does not hold a run: no readable config.json") from error
 
 
@@ -82,20 +160,29 @@ def start(folder: Path, config: dict, rows: list[dict], resume: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         if len(rows) < config["epochs"]:
             write_config(folder, config)
-        write_rows(folder, rows)
+        write_rows(folder, rows, config)
     except OSError as error:
         raise UsageError(f"cannot write to {folder}: {error.strerror}") from error
 
 
-def write_rows(folder: Path, rows: list[dict]) -> None:
-    """progress.csv, and curve.png if there are rows."""
+def save(folder: Path, config: dict, rows: list[dict], parts: tuple) -> None:
+    """The end of an epoch: checkpoint.pt, then progress.csv and curve.png."""
+    state = {"rows": rows, "parts": [part.state_dict() for part in parts]}
+    save_checkpoint(folder, state)
+    write_rows(folder, rows, config)
+
+
+def write_rows(folder: Path, rows: list[dict], config: dict) -> None:
+    """progress.csv and, if there are rows, curve.png and what TensorBoard reads."""
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, COLUMNS)
     table.writeheader()
     table.writerows(rows)
     write_whole(folder / "progress.csv", lambda file: file.write(text.getvalue().encode()))
     if rows:
-        _draw_curve(folder, rows, read_config(folder))
+        _draw_curve(folder, rows, config)
+        if config["tensorboard"]:
+            _write_tensorboard(folder / "tensorboard", rows)
 
 
 def read_rows(folder: Path) -> list[dict[str, float]]:
@@ -112,14 +199,14 @@ def epochs_done(folder: Path) -> int:
 def save_checkpoint(folder: Path, state: dict) -> None:
     """checkpoint.pt, keeping the one before it. state: tensors and plain Python alone."""
 
-    def save(file):
+    def write(file):
         try:
             torch.save({"format": FORMAT, **state}, file)
         except RuntimeError as error:  # torch's own, from closing its archive on a full disk
             raise error.__context__ if isinstance(error.__context__, OSError) else error from None
 
     path = folder / CHECKPOINT
-    write_whole(folder / "checkpoint.new.pt", save)
+    write_whole(folder / "checkpoint.new.pt", write)
     if path.exists():
         os.replace(path, folder / PREVIOUS)
     os.replace(folder / "checkpoint.new.pt", path)
@@ -144,16 +231,32 @@ def load_checkpoint(folder: Path) -> dict | None:
     return None
 
 
-def add_to_tensorboard(folder: Path, row: dict) -> None:
-    """The row's numbers, by epoch, into the folder's TensorBoard log."""
+def restore(folder: Path, parts: tuple) -> list[dict]:
+    """Bring the parts to the state of the newest checkpoint. Returns its rows, none without one."""
+    saved = load_checkpoint(folder)
+    if saved is None:
+        return []
+    for part, state in zip(parts, saved["parts"], strict=True):
+        part.load_state_dict(state)
+    return saved["rows"]
+
+
+def _write_tensorboard(folder: Path, rows: list[dict]) -> None:
+    """The numbers of all rows, by epoch, as the one file in `folder`."""
     from torch.utils.tensorboard import SummaryWriter
 
-    with SummaryWriter(folder / "tensorboard") as board:
-        for name, value in row.items():
-            board.add_scalar(name, value, row["epoch"])
+    older = [*folder.glob("events.*")]
+    with SummaryWriter(folder, filename_suffix=f".{len(rows)}") as board:
+        for row in rows:
+            for name, value in row.items():
+                board.add_scalar(name, value, row["epoch"])
+    for file in older:
+        file.unlink()
 
 
 def _draw_curve(folder: Path, rows: list[dict], config: dict) -> None:
+    from matplotlib.figure import Figure  # half a second that only this needs
+
     epochs = [row["epoch"] for row in rows]
     fig = Figure(figsize=(6, 3.6), layout="constrained")
     ax = fig.subplots()

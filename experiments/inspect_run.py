@@ -1,0 +1,143 @@
+"""Look into the last checkpoint of runs: python -m experiments.inspect_run WHAT DIR...
+
+WHAT is one of
+    effective    how much Eq. (4) prefers, at the paper's temperatures: the effective sample size of
+                 B_h, 1 / Σ p², as a share of its transitions; 100 % is uniform
+    replayed     what each method would draw from the run's B_o: the share of originals, and of
+                 transitions whose goal is still ahead (r = -1), among all draws and weighted by the
+                 paper's weights. In a task with an object the others are mostly at their goal
+                 because nothing has touched it
+    dead         the share of the networks' hidden units that are 0 for all of 4,096 transitions,
+                 and learn no more
+"""
+
+import argparse
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ensemble import MultiHeadMLP, linear
+from harness import settings
+from harness.assemble import Parts, make_replay, restored
+from harness.errors import UsageError
+from harness.settings import METHODS, Config
+from vcp import update_her_buffer, value_consistency_priority
+
+TEMPERATURES = (1, 5, 9, 11, 15)  # Appendix B
+BATCHES = 160  # mini-batches that `replayed` looks at
+SCORED = 4096  # transitions at once, by Algorithm 1
+
+
+def effective_share(p: np.ndarray) -> float:
+    """1 / (N Σ p²) for the probabilities (N,) in B_h: between 1/N, one is always drawn, and 1."""
+    return float(1 / (len(p) * np.square(p).sum()))
+
+
+def effective(its: Parts) -> list[str]:
+    """A cell for each of the TEMPERATURES. UsageError for a run without B_h."""
+    if its.her_buffer is None:
+        raise UsageError(f"a run of --method {its.config.method} has no B_h")
+    variance = its.her_buffer.data["variance"][: its.her_buffer.size]
+    priorities = [value_consistency_priority(variance, t) for t in TEMPERATURES]
+    return [f"{effective_share(p):.1%}" for p in priorities]
+
+
+def drawn(its: Parts, method: str, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """What `method` draws from the run's B_o, with the batch and the B_h of Appendix B's larger
+    tasks: reward, hindsight and weight, (BATCHES·B,) each."""
+    schedule = settings.paper_schedule("FetchPush-v1", method)
+    own = {"heads": its.config.heads, "relabel_ratio": its.config.relabel_ratio}
+    config = settings.complete(Config(its.config.env, method, **own, **schedule))
+    replay = make_replay(config, its.task, its.original_buffer)
+    if method == "vcp":
+        how = (its.agent.q_variance, SCORED, rng, config.relabel_ratio, its.task.reward_fn)
+        for _ in range(replay.capacity // SCORED):
+            update_her_buffer(its.original_buffer, replay, *how)
+    else:
+        replay.new_episodes(np.arange(its.original_buffer.size))
+    batches = [replay.sample(config.batch_size, rng) for _ in range(BATCHES)]
+    names = ("reward", "hindsight", "weight")
+    return {name: np.concatenate([batch[name] for batch in batches]) for name in names}
+
+
+def shares(batch: dict[str, np.ndarray]) -> dict[str, float]:
+    """Of what was drawn: the originals and what is ahead, each also by weight."""
+    kinds = {"originals": ~batch["hindsight"], "ahead": batch["reward"] < 0}
+    weights = {"": np.ones_like(batch["weight"]), " weighted": batch["weight"]}
+    return {
+        f"{kind}{how}": float(np.average(its, weights=w))
+        for kind, its in kinds.items()
+        for how, w in weights.items()
+    }
+
+
+def replayed(its: Parts) -> list[str]:
+    """A cell for each of METHODS; VCP with the critic of one network has none."""
+    rng, cells = np.random.default_rng(0), []
+    for method in METHODS:
+        if method == "vcp" and its.config.heads == 1:
+            cells.append("")
+            continue
+        x = {name: f"{share:.1%}" for name, share in shares(drawn(its, method, rng)).items()}
+        if method == "vcp":
+            x = {n: f"{x[n]} ({x[f'{n} weighted']})" for n in ("originals", "ahead")}
+        cells.append(f"{x['originals']}; {x['ahead']}")
+    return cells
+
+
+@torch.no_grad()
+def hidden(net: MultiHeadMLP, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where the trunk ends, (1, B, H), and the heads' hidden layers, (K, B, H), for x (B, I)."""
+    w1, b1, w2, b2 = net.trunk
+    embedding = linear(linear(x, w1, b1).relu(), w2, b2).relu()
+    return embedding[None], linear(embedding, *net.heads[:2]).relu()
+
+
+def dead_share(units: torch.Tensor) -> float:
+    """The share of units that are 0 for all of the B inputs: (K, B, H) -> a number."""
+    return (units.amax(dim=1) == 0).float().mean().item()
+
+
+def dead(its: Parts) -> list[str]:
+    """A cell for each of actor's trunk, actors' heads, critic's trunk, critics' heads."""
+    episodes, rng = its.original_buffer.episodes, np.random.default_rng(0)
+    e, t = (rng.integers(n, size=4096) for n in episodes["action"].shape[:2])
+    rows = np.hstack([episodes["obs"][e, t], episodes["desired_goal"][e]])
+    state = its.agent.normalizer(torch.from_numpy(rows))
+    state_action = torch.cat([state, torch.from_numpy(episodes["action"][e, t])], 1)
+    layers = hidden(its.agent.actor, state) + hidden(its.agent.critic, state_action)
+    return [f"{dead_share(units):.0%}" for units in layers]
+
+
+TABLES = {
+    "effective": (effective, [f"𝒯 = {t}" for t in TEMPERATURES]),
+    "replayed": (replayed, [f"{method.upper()}: originals; ahead" for method in METHODS]),
+    "dead": (dead, ["actor's trunk", "actors' heads", "critic's trunk", "critics' heads"]),
+}
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        prog="inspect_run.py",
+        description=__doc__,
+        formatter_class=partial(argparse.RawDescriptionHelpFormatter, max_help_position=12),
+    )
+    parser.add_argument("what", choices=TABLES)
+    parser.add_argument("folders", nargs="+", type=Path, metavar="DIR")
+    given = parser.parse_args(argv)
+    cells, columns = TABLES[given.what]
+    try:
+        print(f"| run | epoch | {' | '.join(columns)} |")
+        print("|---" * (2 + len(columns)) + "|")
+        for folder in given.folders:
+            its, rows = restored(folder)
+            name = f"{its.config.env}, {settings.variant(its.config)}"
+            print(f"| {name} | {rows[-1]['epoch']} | {' | '.join(cells(its))} |")
+    except UsageError as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()

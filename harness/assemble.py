@@ -1,0 +1,119 @@
+"""A run's parts, made from its settings: Algorithm 2, line 1."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium as gym
+
+from baselines import cher, dtgsh, herebp
+from baselines.her import HERReplay
+from ensemble import EnsembleDDPG
+from harness import records, settings
+from harness.errors import UsageError
+from harness.settings import Config
+from harness.tasks import Task, examine, make_env
+from harness.workers import ParallelEnvs, whole_heads
+from her import EpisodeBuffer
+from vcp import HERBuffer
+
+
+@dataclass
+class Parts:
+    """What `run.train` works with."""
+
+    config: Config
+    task: Task
+    num_envs: int
+    agent: EnsembleDDPG  # 𝔸
+    original_buffer: EpisodeBuffer  # B_o
+    her_buffer: HERBuffer | None  # B_h; another method has none
+    replay: HERBuffer | HERReplay  # what line 15 draws from: B_h, or another method's
+
+    def state(self) -> tuple:
+        """What a checkpoint keeps."""
+        return self.agent, self.original_buffer, self.replay
+
+    def envs(self) -> ParallelEnvs:
+        """The environments, in their processes."""
+        workers = whole_heads(self.config.num_workers, self.num_envs, self.config.heads)
+        length = self.config.episode_length
+        return ParallelEnvs(self.config.env, self.num_envs, workers, episode_length=length)
+
+
+def assemble(config: Config) -> Parts:
+    """All parts of a run, untrained. config: complete. UsageError for an environment that cannot be
+    learned in."""
+    task = examine(config.env, config.episode_length)
+    if config.buffer_size < task.horizon:
+        raise UsageError(f"--buffer-size must be {task.horizon} or more, to hold an episode")
+    # One environment a head; fewer than 16 heads have several each, for the paper's amount of data.
+    num_envs = config.heads * math.ceil(16 / config.heads)
+    agent = make_agent(config, task)
+    original_buffer = EpisodeBuffer(
+        config.buffer_size, task.horizon, task.obs_dim, task.goal_dim, task.action_dim
+    )
+    if num_envs > original_buffer.capacity:
+        raise UsageError(f"--buffer-size must hold {num_envs} episodes of {task.horizon} steps")
+    replay = make_replay(config, task, original_buffer)
+    her_buffer = replay if config.method == "vcp" else None
+    return Parts(config, task, num_envs, agent, original_buffer, her_buffer, replay)
+
+
+def make_agent(config: Config, task: Task) -> EnsembleDDPG:
+    """The off-policy algorithm 𝔸, with the networks' sizes for the task."""
+    return EnsembleDDPG(
+        obs_dim=task.obs_dim,
+        goal_dim=task.goal_dim,
+        action_dim=task.action_dim,
+        heads=config.heads,
+        gamma=1 - 1 / task.horizon,
+        learning_rate=config.learning_rate,
+        trunk_rate=config.trunk_rate,
+        polyak=config.polyak,
+        action_penalty=config.action_penalty,
+        device=config.device,
+        seed=config.seed,
+    )
+
+
+def make_replay(
+    config: Config, task: Task, original_buffer: EpisodeBuffer
+) -> HERBuffer | HERReplay:
+    """What Algorithm 2, line 15, draws from: B_h, or the replay of another method."""
+    if config.method == "vcp":
+        return HERBuffer(
+            capacity=config.her_buffer_capacity,
+            temperature=config.temperature,
+            priority=config.priority,
+            importance=config.importance,
+        )
+    drawn = config.updates * config.heads  # mini-batches in a cycle
+    at_once = max(n for n in range(1, 41) if drawn % n == 0)
+    her = (original_buffer, config.relabel_ratio, task.reward_fn)
+    if config.method == "her":
+        return HERReplay(*her, at_once=at_once)
+    common = {"env_name": config.env, "faithful": config.faithful, "at_once": at_once}
+    if config.method == "herebp":
+        return herebp.HEREBP(*her, **common, dt=task.dt)
+    if config.method == "cher":
+        return cher.CHER(*her, **common, heads=config.heads, updates=config.cycles * config.updates)
+    return dtgsh.DTGSH(*her, **common)
+
+
+def restored(folder: Path) -> tuple[Parts, list[dict]]:
+    """The parts of the run in `folder` after its last whole epoch, and its rows. A run from a GPU
+    can be restored without one. UsageError if there is none."""
+    config = settings.replace(settings.load(folder), device="auto", tensorboard=False)
+    parts = assemble(settings.complete(config))
+    rows = records.restore(folder, parts.state())
+    if not rows:
+        raise UsageError(f"the run in {folder} has no whole epoch yet")
+    return parts, rows
+
+
+def load(folder: str | Path, **kwargs) -> tuple[EnsembleDDPG, gym.Env]:
+    """The trained agent of the run in `folder`, and its environment; kwargs, such as render_mode,
+    go to the latter. UsageError if there is none."""
+    parts, _ = restored(Path(folder))
+    return parts.agent, make_env(parts.config.env, parts.config.episode_length, **kwargs)

@@ -1,0 +1,102 @@
+"""The command line of run.py: options, messages, exit codes."""
+
+import argparse
+import contextlib
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import NoReturn
+
+from harness import records, settings
+from harness.errors import EnvironmentFailed, UsageError
+from harness.settings import Config
+
+STOPS = (FloatingPointError, OSError, EnvironmentFailed, KeyboardInterrupt)  # no fault of run.py's
+
+
+def main(train: Callable, argv: list[str] | None = None) -> None:
+    """Train, resume or play, as the arguments say. Exit code 2 and one line for bad input, 1 and
+    one line for a run that something outside the program stopped, 130 for Ctrl-C."""
+    sys.path.append(os.getcwd())  # for the user's own module:ID
+    given, command = parse(argv)
+    try:
+        if command.play is not None:
+            from harness.play import play
+
+            play(Path(command.play), command.gif)
+            return
+        config = Config(**given)
+        if command.resume is not None:
+            saved = settings.load(Path(command.resume))
+            config = settings.changed(saved, {**given, "out": command.resume})
+        config = settings.complete(config)
+        try:
+            train(config, resume=command.resume is not None)
+        except STOPS as error:
+            stopped(Path(config.out), error)
+        folder = config.out
+        print(f"{folder}: curve.png, progress.csv; to see it: python run.py --play {folder}")
+    except UsageError as error:
+        fail(str(error))
+    except KeyboardInterrupt:  # while it plays
+        sys.exit(130)
+
+
+def stopped(folder: Path, error: BaseException) -> NoReturn:
+    """Say why the run ended before its last epoch, and how to go on if there is anything to go on
+    with."""
+    done = records.epochs_done(folder)
+    reason = f": {error}" if str(error) else ""
+    way_on = f"; to go on: python run.py --resume {folder}" if done else ""
+    print(f"run.py: stopped in epoch {done + 1}{reason}{way_on}", file=sys.stderr)
+    sys.exit(130 if isinstance(error, KeyboardInterrupt) else 1)
+
+
+def fail(message: str) -> NoReturn:
+    """One line on stderr and exit code 2."""
+    print(f"run.py: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(2)
+
+
+def parse(argv: list[str] | None) -> tuple[dict, argparse.Namespace]:
+    """The command line: the fields of Config that were given, and resume, play and gif."""
+    parser = argparse.ArgumentParser(
+        prog="run.py",
+        description="Train Value Consistency Prioritization, or play what it learned",
+        allow_abbrev=False,
+        add_help=False,
+    )
+    parser.error = fail
+    groups = {name: parser.add_argument_group(name) for name in (settings.RUN, settings.SCHEDULE)}
+    groups |= {
+        f.metadata["group"]: None for f in fields(Config) if f.metadata["group"] not in groups
+    }
+    for name in groups:
+        groups[name] = groups[name] or parser.add_argument_group(name)
+    run = groups[settings.RUN]
+    run.add_argument("-h", "--help", action="help", help="show this and stop")
+    run.add_argument("--resume", metavar="DIR", help="go on with the run in DIR")
+    run.add_argument("--play", metavar="DIR", help="play episodes with what the run in DIR learned")
+    run.add_argument("--gif", metavar="FILE", help="with --play: write an animation, no window")
+    for f in fields(Config):
+        how = {"default": argparse.SUPPRESS, "help": f.metadata["help"].replace("%", "%%")}
+        if settings.kind(f) is bool:
+            how["action"] = "store_true"
+        else:
+            how |= {"type": settings.kind(f), "choices": f.metadata["choices"]}
+            how["help"] += "" if f.default is None else f" (default: {f.default})"
+        groups[f.metadata["group"]].add_argument(settings.flag(f.name), **how)
+    with contextlib.suppress(AttributeError):  # 𝒯 on a terminal that is not UTF-8
+        sys.stdout.reconfigure(errors="replace")
+    given = vars(parser.parse_args(argv))
+    command = argparse.Namespace(**{name: given.pop(name) for name in ("resume", "play", "gif")})
+    for name, value in vars(command).items():
+        if value == "":
+            fail(f"--{name} needs a name, and was given none")
+    if command.resume and command.play:
+        fail("--resume and --play do not go together")
+    if command.gif and not command.play:
+        fail("--gif goes with --play")
+    return given, command

@@ -1,0 +1,11 @@
+"""The error that is the user's to mend."""
+
+
+class UsageError(ValueError):
+    """What was asked for cannot be done. The command line prints it as one line and exits with
+    code 2."""
+
+
+class EnvironmentFailed(RuntimeError):
+    """An environment did in the course of a run what it must not do: it raised an error, or ended
+    an episode early."""

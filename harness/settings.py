@@ -1,0 +1,248 @@
+"""Every setting of a run, the paper's schedule, and what is refused."""
+
+import importlib.util
+import math
+import operator
+import re
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, get_args
+
+import torch
+
+from harness import records
+from harness.errors import UsageError
+from vcp import IMPORTANCE, PRIORITIES
+
+METHODS = ["vcp", "her", "herebp", "cher", "dtgsh"]
+RUN, SCHEDULE, VCP = "the run", "Appendix B: schedule, HER and DDPG", "Section 4: VCP"
+COMPARISON, MACHINE = "Section 5: comparisons and ablations", "the machine"
+
+
+def setting(default: Any, group: str, text: str, choices: list[str] | None = None, **limits) -> Any:
+    """A field of Config: where --help shows it, what it says there, and the values it may have:
+    one of `choices`, `least` or more, more than `above`, `most` or less."""
+    metadata = {"group": group, "help": text, "choices": choices, "limits": limits}
+    return field(default=default, metadata=metadata)
+
+
+@dataclass
+class Config:
+    """Every setting of a run. NOTES.md says which of them the paper gives, and where."""
+
+    env: str = setting("FetchReach-v1", RUN, "the paper's name, a goal environment's id, module:ID")
+    method: str = setting("vcp", COMPARISON, "the method that decides what is replayed", METHODS)
+    seed: int = setting(0, RUN, "the run's random numbers follow from it", least=0, most=2**32 - 1)
+    out: str | None = setting(
+        None, RUN, "the run's folder (default: runs/ENV/METHOD/seedSEED, METHOD with what differs)"
+    )
+    tensorboard: bool = setting(False, RUN, "write the rows for TensorBoard, which must be there")
+    # Appendix B; None is filled in by `complete`
+    epochs: int = setting(50, SCHEDULE, "epochs, M in Algorithm 2", least=1)
+    cycles: int | None = setting(
+        None, SCHEDULE, "collections an epoch, n (default: 5, 15 or 50 by environment)", least=1
+    )
+    updates: int | None = setting(
+        None, SCHEDULE, "updates of each head a cycle (default: 5 or 40 by environment)", least=1
+    )
+    batch_size: int | None = setting(
+        None, SCHEDULE, "transitions in a head's mini-batch (default: 64 or 256)", least=1
+    )
+    episode_length: int | None = setting(
+        None, SCHEDULE, "steps of an episode, T (default: 50, or the environment's own)", least=1
+    )
+    buffer_size: int = setting(1_000_000, SCHEDULE, "transitions that B_o holds", least=1)
+    relabel_ratio: float = setting(
+        0.8, SCHEDULE, "share of transitions with a hindsight goal, k/(1+k)", least=0, most=1
+    )
+    learning_rate: float = setting(1e-3, SCHEDULE, "Adam's, of actors and critics", above=0)
+    trunk_rate: float | None = setting(
+        None, SCHEDULE, "the shared trunks' share of it (default: 1, or 1/K by updates)", above=0
+    )
+    polyak: float = setting(0.95, SCHEDULE, "what a target network keeps, a cycle", least=0, most=1)
+    noise: float = setting(0.2, SCHEDULE, "standard deviation of the exploration noise", least=0)
+    random_actions: float = setting(
+        0.3, SCHEDULE, "share of actions that are uniformly random", least=0, most=1
+    )
+    action_penalty: float = setting(
+        1.0, SCHEDULE, "weight of mean(μ²) in the actor's loss", least=0
+    )
+    eval_episodes: int = setting(
+        160, SCHEDULE, "test episodes an epoch; rounded up to the same for each head", least=1
+    )
+    heads: int = setting(16, VCP, "actors and critics, K", least=1)
+    temperature: float = setting(
+        9.0, VCP, "𝒯 in Eq. (4); the paper takes one of 1, 5, 9, 11, 15", least=0
+    )
+    importance: str = setting(
+        "paper", VCP, "loss weights w_i: Section 4.3's, Schaul et al.'s, or all 1", [*IMPORTANCE]
+    )
+    scored_per_drawn: float = setting(
+        1.0, VCP, "transitions that Algorithm 1 scores for each one drawn", above=0
+    )
+    her_buffer_capacity: int | None = setting(
+        None, VCP, "transitions that B_h holds (default: as many as a cycle draws)", least=1
+    )
+    priority: str = setting(
+        "consistency", COMPARISON, "Eq. (4), or an ablation of Section 5.6", [*PRIORITIES]
+    )
+    acting_head: str = setting(
+        "all", COMPARISON, "the heads that collect episodes, Section 5.6", ["all", "one"]
+    )
+    faithful: bool = setting(
+        False, COMPARISON, "herebp, cher, dtgsh with the flaws of their released code"
+    )
+    device: str = setting(
+        "auto", MACHINE, "where the networks are; auto: a GPU if any", ["auto", "cpu", "cuda"]
+    )
+    num_workers: int | None = setting(
+        None, MACHINE, "processes for the environments (default: one a core)", least=1
+    )
+
+
+OF_VCP = ("temperature", "priority", "importance", "scored_per_drawn", "her_buffer_capacity")
+MAY_CHANGE = ("epochs", "out", "device", "num_workers", "tensorboard")  # when a run is resumed
+
+
+def paper_schedule(env: str, method: str = "vcp") -> dict[str, int]:
+    """Appendix B's n and batch size. Not in the paper: the number of updates."""
+    if method == "dtgsh":  # Appendix B: batch 64 everywhere, and as many transitions as the others
+        schedule = paper_schedule(env)
+        updates = schedule["updates"] * schedule["batch_size"] // 64
+        return {**schedule, "batch_size": 64, "updates": updates}
+    if env.startswith("FetchReach"):
+        return {"cycles": 5, "updates": 5, "batch_size": 64}
+    if env.startswith(("Reacher", "SparseReacher")):
+        return {"cycles": 15, "updates": 5, "batch_size": 64}
+    return {"cycles": 50, "updates": 40, "batch_size": 256}
+
+
+def trunk_share(updates: int, heads: int) -> float:
+    """The trunks' share of the learning rate where none is given (not in the paper). With few
+    updates a cycle, 1, Algorithm 2 to the letter: the trunks take K whole steps, one with each
+    head. With many these K steps add up to one (NOTES.md, "The trunk's step")."""
+    return 1.0 if updates <= 5 else 1 / heads
+
+
+def drawn_a_sweep(config: Config) -> int:
+    """Transitions that one update of all heads draws."""
+    return config.batch_size * config.heads
+
+
+def scored_a_sweep(config: Config) -> int:
+    """Transitions that Algorithm 1 scores meanwhile."""
+    return round(config.scored_per_drawn * drawn_a_sweep(config))
+
+
+def complete(config: Config) -> Config:
+    """A copy with schedule, capacity, device and folder filled in. UsageError for a setting of the
+    wrong type, out of range, or of another method."""
+    given = {name: value for name, value in asdict(config).items() if value is not None}
+    for f in fields(Config):
+        if f.name in given:
+            given[f.name] = checked(f, given[f.name])
+    method = given.get("method", "vcp")
+    config = Config(**{**paper_schedule(given.get("env", Config.env), method), **given})
+    for name in OF_VCP if method != "vcp" else ():
+        if getattr(config, name) != getattr(Config, name):
+            raise UsageError(f"{flag(name)} goes with --method vcp, not with {method}")
+    if config.faithful and method in ("vcp", "her"):
+        raise UsageError(f"--faithful does not go with --method {method}")
+    if method == "cher" and config.batch_size < 2:
+        raise UsageError("--method cher selects from twice the batch: --batch-size 2 or more")
+    if method == "vcp":
+        scored, drawn = scored_a_sweep(config), drawn_a_sweep(config)
+        if not scored:
+            raise UsageError(f"--scored-per-drawn must be {1 / drawn:g} or more to score anything")
+        # B_h holds what a cycle draws (not in the paper; the released code's).
+        capacity = config.her_buffer_capacity or max(drawn * config.updates, scored)
+        if scored > capacity:
+            raise UsageError(f"{scored} transitions are scored at once, and B_h holds {capacity}")
+        config.her_buffer_capacity = capacity
+    if config.trunk_rate is None:
+        config.trunk_rate = trunk_share(config.updates, config.heads)
+    if config.device == "auto":
+        config.device = "cuda" if torch.cuda.is_available() else "cpu"
+    if config.device == "cuda" and not torch.cuda.is_available():
+        raise UsageError("--device cuda: no CUDA device was found")
+    if config.tensorboard and importlib.util.find_spec("tensorboard") is None:
+        raise UsageError("--tensorboard: the package is missing (pip install tensorboard)")
+    if config.out is None:
+        config.out = f"runs/{default_folder(config)}"
+    return config
+
+
+def checked(f, value: Any) -> Any:
+    """The value of a field of Config, in its type. UsageError for another type or range."""
+    what, its, limits = flag(f.name), kind(f), f.metadata["limits"]
+    if its is float and type(value) is int:
+        value = float(value)
+    if type(value) is not its:
+        raise UsageError(f"{what} must be of type {its.__name__}, not {value!r}")
+    if f.metadata["choices"] and value not in f.metadata["choices"]:
+        raise UsageError(f"{what} must be one of {', '.join(f.metadata['choices'])}, not {value!r}")
+    if its is float and not math.isfinite(value):
+        raise UsageError(f"{what} must be a finite number, not {value}")
+    for limit, refused, words in (
+        ("least", operator.lt, "{} or more"),
+        ("above", operator.le, "above {}"),
+        ("most", operator.gt, "{} or less"),
+    ):
+        if limit in limits and refused(value, limits[limit]):
+            raise UsageError(f"{what} must be {words.format(limits[limit])}, not {value}")
+    return value
+
+
+def differences(config: Config) -> dict[str, Any]:
+    """The settings of a complete Config that its environment and method alone would not give, but
+    for the seed and what may change when it is resumed."""
+    default = complete(Config(env=config.env, method=config.method, out=""))
+    # These two follow from others where they are not given.
+    follows = complete(replace(config, trunk_rate=None, her_buffer_capacity=None, out=""))
+    default.trunk_rate, default.her_buffer_capacity = (
+        follows.trunk_rate,
+        follows.her_buffer_capacity,
+    )
+    names = [f.name for f in fields(Config) if f.name not in ("seed", *MAY_CHANGE)]
+    pairs = {name: (getattr(config, name), getattr(default, name)) for name in names}
+    return {name: value for name, (value, usual) in pairs.items() if value != usual}
+
+
+def variant(config: Config) -> str:
+    """What a run is called: its method, and each setting that differs."""
+    parts = [f"{name}-{value}" for name, value in differences(config).items()]
+    return "_".join([config.method, *parts])
+
+
+def default_folder(config: Config) -> str:
+    """Where below runs/ the run is."""
+    env = re.sub(r"[^\w.-]+", "-", config.env)  # Windows refuses a colon
+    return f"{env}/{variant(config)}/seed{config.seed}"
+
+
+def load(folder: Path) -> Config:
+    """The settings of the run in `folder`. UsageError if it holds none, or another version's."""
+    try:
+        return Config(**records.read_config(folder))
+    except TypeError as error:
+        raise UsageError(f"{folder} holds a run of another version ({error})") from error
+
+
+def changed(saved: Config, given: dict[str, Any]) -> Config:
+    """A saved run's settings with those that may change taken from `given`.
+    UsageError if one that may not differs."""
+    for name, value in given.items():
+        if name not in MAY_CHANGE and getattr(saved, name) != value:
+            was = getattr(saved, name)
+            raise UsageError(f"the run was made with {flag(name)} {was}, not {value}")
+    return replace(saved, **{name: given[name] for name in MAY_CHANGE if name in given})
+
+
+def flag(name: str) -> str:
+    """The option of a field: batch_size -> --batch-size."""
+    return "--" + name.replace("_", "-")
+
+
+def kind(f) -> type:
+    """bool, int, float or str, for a field of Config that may also be None."""
+    return next(t for t in (bool, int, float, str) if t in (f.type, *get_args(f.type)))

@@ -1,0 +1,30 @@
+"""Tests of a run's parts."""
+
+import numpy as np
+import pytest
+
+import run
+from harness.assemble import assemble, load
+from harness.errors import UsageError
+from harness.settings import complete
+from harness.testing import SMALL
+from run import Config
+
+
+def test_a_run_is_loaded_to_act(tmp_path):
+    run.train(Config(**SMALL, epochs=1, out=str(tmp_path / "run")))
+    agent, env = load(tmp_path / "run", render_mode="rgb_array")
+    obs, _ = env.reset(seed=0)
+    action = agent.act(obs["observation"][None, None], obs["desired_goal"][None, None], slice(1))
+    assert env.action_space.contains(action[0, 0]) and env.render().ndim == 3
+    again, _ = load(str(tmp_path / "run"))
+    rows = np.zeros((2, 3, 2))
+    np.testing.assert_array_equal(agent.act(rows, rows), again.act(rows, rows))
+    with pytest.raises(UsageError, match="does not hold a run"):
+        load(tmp_path)
+
+
+def test_a_buffer_too_small_for_what_is_collected_is_refused():
+    for size, message in ((49, "50 or more"), (799, "hold 16 episodes of 50 steps")):
+        with pytest.raises(UsageError, match=message):
+            assemble(complete(Config(env="PointMassEmptyEnv-v1", buffer_size=size)))

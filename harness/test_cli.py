@@ -1,0 +1,188 @@
+"""Tests of the command line: bad input, what ends a run, what is left behind."""
+
+import json
+import multiprocessing
+import os
+import re
+import signal
+import threading
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+import envs_point
+import run
+from harness import records
+from harness.records import load_checkpoint
+from harness.testing import ARGUMENTS, SMALL, command, finish, main, start
+from run import Config
+
+
+def test_the_command_line_from_another_folder(tmp_path):
+    arguments = "--env PointMassEmptyEnv-v1 --epochs 1 --cycles 2 --updates 1 --batch-size 16"
+    code, out, err = command(*arguments.split(), "--eval-episodes", "16", cwd=tmp_path)
+    assert code == 0 and out.startswith("PointMassEmptyEnv-v1: our NumPy version"), err
+    assert max(map(len, out.splitlines()[:-1])) <= 80 and "epoch 1/1" in out and "success" in out
+    name = "vcp_cycles-2_updates-1_batch_size-16_eval_episodes-16"
+    folder = Path("runs", "PointMassEmptyEnv-v1", name, "seed0")
+    assert out.splitlines()[-1].endswith(f"python run.py --play {folder}")
+    folder = tmp_path / folder
+    files = {"config.json", "progress.csv", "curve.png", "checkpoint.pt"}
+    assert files == {p.name for p in folder.iterdir()}
+    settings = json.loads((folder / "config.json").read_text())
+    assert settings["config"]["updates"] == 1 and settings["versions"]["mujoco"]
+
+
+def children(pid):
+    return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+
+
+def gone(pids):
+    """Whether no process of these is left, waiting a little for the last."""
+    for _ in range(100):
+        left = [p for p in pids if Path(f"/proc/{p}").exists()]
+        if not left:
+            return True
+        time.sleep(0.1)
+    return False
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks for processes in /proc")
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL, "worker"])
+def test_nothing_is_left_running(sent, tmp_path):
+    folder = tmp_path / "run"
+    arguments = [a for a in ARGUMENTS if "workers" not in a]
+    process = start(*arguments, "--num-workers=2", "--epochs=1000", f"--out={folder}")
+    while not (folder / records.CHECKPOINT).exists() and process.poll() is None:
+        time.sleep(0.05)
+    workers = children(process.pid)
+    assert len(workers) == 2
+    if sent == "worker":
+        os.kill(int(workers[0]), signal.SIGKILL)
+    elif sent == signal.SIGINT:
+        os.killpg(process.pid, sent)  # a terminal's Ctrl-C goes to the whole group
+    else:
+        process.send_signal(sent)
+    code, _, err = finish(process)
+    assert gone(workers)
+    if sent == signal.SIGINT:
+        assert code == 130 and f"--resume {folder}" in err and "Traceback" not in err, err
+    if sent == "worker":
+        assert code == 1 and "died (exit code -9" in err and "PointMassEmptyEnv-v1" in err
+        assert "Traceback" not in err
+    assert len(load_checkpoint(folder)["rows"]) >= 1
+
+
+class Hasty(envs_point.PointMass):
+    """Ends its episodes at step 7."""
+
+    def step(self, action):
+        self.steps = getattr(self, "steps", 0) + 1
+        obs, reward, _, _, info = super().step(action)
+        return obs, reward, self.steps == 7, False, info
+
+
+gym.register("Hasty-v0", Hasty, max_episode_steps=10)
+
+
+def test_a_nan_stops_the_run_and_says_where(tmp_path):
+    settings = {**SMALL, "env": "Broken-v0", "out": str(tmp_path / "run"), "epochs": 1}
+    with pytest.raises(FloatingPointError, match="obs of an episode"):
+        run.train(Config(**settings))
+    assert threading.active_count() == 1
+    settings = {**SMALL, "env": "BrokenReward-v0", "out": str(tmp_path / "reward"), "epochs": 1}
+    with pytest.raises(FloatingPointError, match="in the rewards"):
+        run.train(Config(**settings))
+    settings = {**SMALL, "out": str(tmp_path / "lr"), "epochs": 1, "learning_rate": 1e30}
+    with pytest.raises(FloatingPointError, match="variance of the Q-values"):
+        run.train(Config(**settings))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_environment_that_ends_its_episodes_early_is_refused(workers, tmp_path, capfd):
+    arguments = [a for a in ARGUMENTS if not a.startswith(("--env", "--num-workers"))]
+    with pytest.raises(SystemExit) as stop:
+        main([*arguments, "--env=Hasty-v0", f"--num-workers={workers}", f"--out={tmp_path}/r"])
+    assert stop.value.code == 2 and not multiprocessing.active_children()
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "epoch" not in line]
+    assert line.startswith("run.py: cannot learn in the environment Hasty-v0: an episode ended in")
+    assert not list(tmp_path.iterdir())
+
+
+BAD = [
+    ("--env FetchRech-v1", "FetchReach-v1"),
+    ("--env CartPole-v1", "no goals"),
+    ("--env FetchReach-v2", "FetchReach-v4"),
+    ("--env FetchReachDense-v4", "-1 and 0"),
+    ("--env nowhere:Env-v0", "nowhere"),
+    ("--env=", "cannot make"),
+    ("--method sac", "--method"),
+    ("--epochs 0", "--epochs must be 1 or more"),
+    ("--epochs many", "--epochs"),
+    ("--epochs 1.5", "--epochs"),
+    ("--cycles 0", "--cycles must be 1 or more"),
+    ("--updates -1", "--updates must be 1 or more"),
+    ("--batch-size 0", "--batch-size must be 1 or more"),
+    ("--eval-episodes 0", "--eval-episodes must be 1 or more"),
+    ("--heads 0", "--heads must be 1 or more"),
+    ("--num-workers 0", "--num-workers must be 1 or more"),
+    ("--seed -1", "--seed must be 0 or more"),
+    ("--temperature nan", "--temperature must be a finite number"),
+    ("--temperature inf", "--temperature must be a finite number"),
+    ("--temperature hot", "--temperature"),
+    ("--priority energy", "--priority"),
+    ("--method her --priority variance", "--priority goes with --method vcp"),
+    ("--method cher --temperature 5", "--temperature goes with --method vcp"),
+    ("--method cher --batch-size 1", "--batch-size 2 or more"),
+    ("--method her --faithful", "--faithful does not go with --method her"),
+    ("--importance yes", "--importance"),
+    ("--acting-head none", "--acting-head"),
+    ("--device tpu", "--device"),
+    ("--nonsense", "--nonsense"),
+    ("--out full", "already holds a run"),
+    ("--out full/config.json/below", "cannot write"),
+    ("--resume nowhere", "does not hold a run"),
+    ("--resume broken", "does not hold a run"),
+    ("--resume older", "another version"),
+    ("--play nowhere", "does not hold a run"),
+    ("--play full", "no whole epoch"),
+    ("--gif a.gif", "--gif goes with --play"),
+    ("--play full --resume full", "do not go together"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[b[0] for b in BAD])
+def test_bad_input_gets_one_line_and_exit_code_2(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    older = json.dumps({"config": {"no_such_setting": 1}})
+    for name, text in (("full", json.dumps({"config": SMALL})), ("broken", "{"), ("older", older)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text(text)
+    before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}
+    ours = [] if "--resume" in arguments or "--play" in arguments else ["--env", SMALL["env"]]
+    with pytest.raises(SystemExit) as stop:
+        main([*ours, *arguments.split()])
+    out, err = capsys.readouterr()
+    assert stop.value.code == 2
+    assert out == "" and err.count("\n") == 1 and message in err and "Traceback" not in err
+    assert before == {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}
+
+
+def test_help_names_every_option_and_default(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    text = re.sub(r"\s+", " ", capsys.readouterr().out)
+    assert stop.value.code == 0
+    for name in (
+        "--scored-per-drawn",
+        "--learning-rate",
+        "--acting-head",
+        "--resume",
+        "--play",
+        "--gif",
+        "--tensorboard",
+    ):
+        assert name in text
+    assert "𝒯 in Eq. (4)" in text and "(default: 9.0)" in text and "(default: 16)" in text

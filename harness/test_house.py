@@ -1,0 +1,101 @@
+"""Tests of the house: who imports whom, and what can be taken out of it."""
+
+import ast
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from harness.testing import HERE
+
+CORE = {"run", "vcp", "her", "ensemble", "envs_point"}
+ROOMS = ("harness", "baselines", "experiments")
+# What each may import: modules of the core by their names, rooms by theirs.
+ARROWS = {
+    "run": {"vcp", "her", "ensemble", "harness"},
+    "vcp": {"her", "ensemble"},
+    "her": set(),
+    "ensemble": set(),
+    "envs_point": set(),
+    "harness": {"vcp", "her", "ensemble", "envs_point", "harness"},
+    "baselines": {"her", "baselines"},
+    "experiments": {"run", "vcp", "her", "ensemble", "harness", "experiments"},
+}
+
+
+def modules() -> dict[str, Path]:
+    """Every module that is no test, by its dotted name."""
+    files = [HERE / f"{name}.py" for name in CORE]
+    files += [file for room in ROOMS for file in (HERE / room).glob("*.py")]
+    names = [".".join(file.relative_to(HERE).with_suffix("").parts) for file in files]
+    tests = ("test_", "testing")
+    pairs = zip(names, files, strict=True)
+    return {n: f for n, f in pairs if not n.split(".")[-1].startswith(tests) and "__" not in n}
+
+
+def imported(file: Path) -> set[str]:
+    """The project's modules that a file imports, also within functions, by their dotted names."""
+    known, found = modules(), set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found & known.keys()
+
+
+@pytest.mark.parametrize("name", modules())
+def test_arrows_lead_where_the_plan_has_them(name):
+    room = name.split(".")[0]
+    allowed = ARROWS[room] | ({"baselines"} if name == "harness.assemble" else set())
+    assert {other.split(".")[0] for other in imported(modules()[name])} <= allowed
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    graph = {name: imported(file) for name, file in modules().items()}
+    assert "her" in graph["vcp"] and "harness.cli" in graph["run"]  # they are read at all
+    while graph:
+        free = [name for name, others in graph.items() if not others & graph.keys()]
+        assert free, f"a circle among {sorted(graph)}"
+        for name in free:
+            del graph[name]
+
+
+def python(program: str, folder: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=folder
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_method_can_be_taken_out(tmp_path):
+    """vcp.py beside her.py and ensemble.py in an empty folder, with NumPy and PyTorch alone."""
+    for name in ("vcp", "her", "ensemble"):
+        shutil.copy(HERE / f"{name}.py", tmp_path)
+    program = """
+import sys
+for name in ("gymnasium", "gymnasium_robotics", "mujoco", "matplotlib", "tqdm", "harness"):
+    sys.modules[name] = None
+import numpy as np
+from her import EpisodeBuffer
+from ensemble import EnsembleDDPG
+from vcp import HERBuffer, update_her_buffer
+rng = np.random.default_rng(0)
+original_buffer, her_buffer = EpisodeBuffer(100, 10, 3, 2, 2), HERBuffer(500, 9.0)
+shapes = {"obs": (4, 11, 3), "achieved_goal": (4, 11, 2), "desired_goal": (4, 2)}
+shapes["action"] = (4, 10, 2)
+original_buffer.add({name: rng.normal(size=shape) for name, shape in shapes.items()}, rng)
+agent = EnsembleDDPG(3, 2, 2, gamma=0.9, heads=4)
+reward_fn = lambda a, b: -1.0 * (np.linalg.norm(a - b, axis=-1) > 0.1)
+update_her_buffer(original_buffer, her_buffer, agent.q_variance, 300, rng, 0.8, reward_fn)
+print(agent.update_head(2, her_buffer.sample(64, rng)).isfinite().all().item())
+"""
+    assert python(program, tmp_path) == "True\n"
+
+
+def test_a_runs_folder_is_read_without_mujoco_and_matplotlib():
+    program = "import sys, harness.records\nprint({'mujoco', 'matplotlib'} & set(sys.modules))"
+    assert python(program, HERE) == "set()\n"

@@ -1,0 +1,65 @@
+"""Tests of how PyTorch is told to compute."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from harness.numerics import fast_products, one_thread, small_calls
+from harness.testing import HERE, SMALL_TRAINING
+
+
+def test_fast_products_are_float32_or_left_alone(monkeypatch):
+    torch.manual_seed(0)
+    setting, x, w = torch.backends.mkldnn.matmul, torch.randn(256, 300), torch.randn(300, 256)
+    before, threads = setting.fp32_precision, torch.get_num_threads()
+    torch.set_num_threads(2)
+    with pytest.raises(KeyError), fast_products(), one_thread():
+        assert torch.get_num_threads() == 1
+        assert (x @ w - x.double() @ w.double()).abs().max() < 1e-4
+        inside = setting.fp32_precision
+        with small_calls():
+            assert setting.fp32_precision == "ieee"
+        assert setting.fp32_precision == inside
+        raise KeyError
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(threads)
+    assert setting.fp32_precision == before
+
+    def rounded(a, b):
+        return torch.mm(a.bfloat16().float(), b.bfloat16().float())
+
+    assert (rounded(x, w) - x @ w).abs().max() > 1e-2
+    monkeypatch.setattr(torch.Tensor, "__matmul__", rounded)  # a processor that rounds
+    with fast_products():
+        assert setting.fp32_precision == before
+
+
+def test_training_takes_denormals_for_zero_in_all_threads(tmp_path):
+    """In a process of its own: PyTorch's threads have the setting from when they are started."""
+    program = f"""
+import torch, run
+from ensemble import EnsembleDDPG
+def zeros():
+    return (torch.full((1_000_000,), 1e-20).square() == 0).float().mean().item()
+torch.set_num_threads(2)
+def zeros_in_threads(agent):
+    print("threads", torch.get_num_threads())
+    torch.set_num_threads(2)
+    print("zeros", zeros())
+    torch.set_num_threads(1)
+EnsembleDDPG.update_targets = zeros_in_threads
+run.train(run.Config(env="PointMassEmptyEnv-v1", out={str(tmp_path / "run")!r}, **{SMALL_TRAINING}))
+torch.set_num_threads(1)
+print("afterwards", zeros())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        cwd=HERE,
+    )
+    lines = done.stdout.splitlines()
+    assert lines.count("zeros 1.0") == lines.count("threads 1") == SMALL_TRAINING["cycles"], done
+    assert lines[-1] == "afterwards 0.0"

@@ -1,0 +1,162 @@
+"""Tests of a run's folder: checkpoints, kills and resumes.
+
+A killed and resumed run must end like one that was never stopped: the same rows, timing columns
+aside, and the same weights.
+"""
+
+import multiprocessing
+import os
+import random
+import signal
+import threading
+import time
+
+import pytest
+import torch
+
+import run
+from harness import records
+from harness.records import read_rows
+from harness.testing import ARGUMENTS, SMALL, assert_same_run, finish, main, start
+from run import Config
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one(whole, tmp_path):
+    folder = tmp_path / "run"
+    run.train(Config(**SMALL, epochs=2, out=str(folder)))
+    rows = run.train(Config(**SMALL, epochs=4, out=str(folder)), resume=True)
+    assert len(rows) == 4
+    seconds = [row["wall_seconds"] for row in rows]
+    assert seconds == sorted(seconds)
+    assert_same_run(whole, folder)
+
+
+def test_a_resumed_run_of_a_robot_equals_an_uninterrupted_one(tmp_path):
+    settings = {**SMALL, "env": "FetchPush-v1", "cycles": 1, "num_workers": 2, "temperature": 5.0}
+    run.train(Config(**settings, epochs=2, out=str(tmp_path / "whole")))
+    for epochs, resume in ((1, False), (2, True)):
+        run.train(Config(**settings, epochs=epochs, out=str(tmp_path / "parts")), resume)
+    assert_same_run(tmp_path / "whole", tmp_path / "parts")
+    assert not multiprocessing.active_children() and threading.active_count() == 1
+    settings = {**settings, "env": "Broken-v0", "out": str(tmp_path / "broken")}
+    with pytest.raises(FloatingPointError):
+        run.train(Config(**settings))
+    assert not multiprocessing.active_children() and threading.active_count() == 1
+
+
+def test_resuming_from_the_command_line(whole, tmp_path, capsys):
+    folder = tmp_path / "run"
+    main([*ARGUMENTS, "--epochs=1", f"--out={folder}"])
+    for wrong in (["--seed=1"], ["--heads=3"], ["--temperature=5"]):
+        with pytest.raises(SystemExit) as stop:
+            main([f"--resume={folder}", *wrong])
+        assert stop.value.code == 2 and "the run was made with" in capsys.readouterr().err
+    main([f"--resume={folder}", "--epochs=4", "--temperature=9"])
+    assert_same_run(whole, folder)
+    about = (folder / "config.json").read_text().replace('"commit": ', '"commit": "older", "was": ')
+    (folder / "config.json").write_text(about)
+    main([f"--resume={folder}"])  # nothing is left to do
+    assert_same_run(whole, folder)
+    assert (folder / "config.json").read_text() == about
+
+
+@pytest.mark.slow
+def test_killed_at_ten_random_moments(whole, tmp_path):
+    folder, rng = tmp_path / "run", random.Random(0)
+
+    def go_on():
+        begun = (folder / "config.json").exists()
+        how = [f"--resume={folder}"] if begun else [*ARGUMENTS, f"--out={folder}"]
+        return start(*how, "--epochs=4")
+
+    began = time.monotonic()
+    assert finish(start(*ARGUMENTS, f"--out={tmp_path / 'timed'}", "--epochs=4"))[0] == 0
+    seconds = time.monotonic() - began  # half of it to import PyTorch
+    for _ in range(10):
+        process = go_on()
+        time.sleep(rng.uniform(0.1, 1) * seconds)
+        os.killpg(process.pid, signal.SIGKILL)
+        finish(process)
+    code, _, err = finish(go_on())
+    assert code == 0, err
+    assert_same_run(whole, folder)
+
+
+KILL_IN_SAVE = """
+import os, signal, sys, torch, run
+save, saves = torch.save, []
+def half(state, file):
+    saves.append(1)
+    save(state, file)
+    if len(saves) == 2:
+        file.flush()
+        file.truncate(file.tell() // 2)
+        os.kill(os.getpid(), signal.SIGKILL)
+torch.save = half
+run.cli.main(run.train, sys.argv[1:])
+"""
+
+
+KILL_BETWEEN_RENAMES = """
+import os, signal, sys, run
+replace, moved = os.replace, []
+def one(a, b):
+    replace(a, b)
+    if str(b).endswith("previous.pt"):
+        os.kill(os.getpid(), signal.SIGKILL)
+os.replace = one
+run.cli.main(run.train, sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize("program", [KILL_IN_SAVE, KILL_BETWEEN_RENAMES], ids=["save", "rename"])
+def test_killed_while_the_checkpoint_is_written(program, whole, tmp_path):
+    folder = tmp_path / "run"
+    process = start(*ARGUMENTS, "--epochs=4", f"--out={folder}", program=program)
+    assert finish(process)[0] == -signal.SIGKILL
+    main([f"--resume={folder}"])
+    assert_same_run(whole, folder)
+    assert {p.name for p in folder.iterdir()} == {
+        "config.json", "progress.csv", "curve.png", records.CHECKPOINT, records.PREVIOUS,
+    }  # fmt: skip
+
+
+def test_a_full_disk_stops_the_run_and_keeps_the_last_epoch(whole, tmp_path):
+    folder = tmp_path / "run"
+    main([*ARGUMENTS, "--epochs=1", f"--out={folder}"])
+    code, _, err = finish(start(f"--resume={folder}", "--epochs=4", limit=1_000_000))
+    assert code == 1 and err.count("\n") == 1, err
+    assert "stopped in epoch 2: " in err and "--resume" in err
+    assert len(read_rows(folder)) == 1 and not list(folder.glob("*.tmp"))
+    main([f"--resume={folder}", "--epochs=4"])
+    assert_same_run(whole, folder)
+
+
+def test_a_damaged_checkpoint_is_refused_and_the_one_before_is_used(whole, tmp_path, capsys):
+    folder = tmp_path / "run"
+    main([*ARGUMENTS, "--epochs=2", f"--out={folder}"])
+    path = folder / records.CHECKPOINT
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    main([f"--resume={folder}", "--epochs=4"])
+    assert "is damaged" in capsys.readouterr().out
+    assert_same_run(whole, folder)
+    for name in (records.CHECKPOINT, records.PREVIOUS):
+        (folder / name).write_bytes(b"PK" + bytes(1000))
+    before = sorted((p.name, p.stat().st_mtime) for p in folder.iterdir())
+    with pytest.raises(SystemExit) as stop:
+        main([f"--resume={folder}"])
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and "damaged" in err and err.count("\n") == 1
+    assert before == sorted((p.name, p.stat().st_mtime) for p in folder.iterdir())
+
+
+@pytest.mark.parametrize("option", ["--resume", "--play"])
+def test_a_checkpoint_of_another_version_is_refused(option, tmp_path, capsys):
+    main([*ARGUMENTS, "--epochs=1", f"--out={tmp_path}"])
+    path = tmp_path / records.CHECKPOINT
+    torch.save({**torch.load(path, weights_only=True), "format": 1}, path)
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        main([f"{option}={tmp_path}"])
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and "another version" in err and err.count("\n") == 1

@@ -1,0 +1,70 @@
+"""Tests of the settings and the schedule."""
+
+import importlib.util
+import math
+
+import pytest
+import torch
+
+from harness import settings
+from harness.assemble import make_agent
+from harness.errors import UsageError
+from harness.settings import Config
+from harness.tasks import PAPER_ENVS, examine
+
+
+def test_the_schedule_is_appendix_b():
+    schedule = {name: tuple(settings.paper_schedule(name).values()) for name in PAPER_ENVS}
+    assert schedule.pop("FetchReach-v1")[:3] == (5, 5, 64)
+    assert schedule.pop("Reacher-v2")[:3] == (15, 5, 64)
+    assert {s[:3] for s in schedule.values()} == {(50, 40, 256)}
+    c = Config()
+    assert (c.heads, c.epochs, c.eval_episodes, c.buffer_size) == (16, 50, 160, 1_000_000)
+    assert (c.relabel_ratio, c.learning_rate, c.polyak) == (0.8, 1e-3, 0.95)
+    assert (c.noise, c.random_actions, c.action_penalty, c.temperature) == (0.2, 0.3, 1.0, 9.0)
+
+
+@pytest.mark.parametrize(
+    "given, rate",
+    [
+        ({}, 1),
+        ({"env": "FetchPush-v1"}, 1 / 16),
+        ({"env": "FetchPush-v1", "updates": 5}, 1),
+        ({"env": "HandReach-v0", "heads": 4, "method": "dtgsh"}, 1 / 4),
+        ({"env": "FetchPush-v1", "heads": 1, "method": "her"}, 1),
+        ({"env": "FetchPush-v1", "trunk_rate": 0.5}, 0.5),
+    ],
+)
+def test_with_many_updates_the_trunks_steps_add_up_to_one(given, rate):
+    config = settings.complete(Config(**given))
+    assert config.trunk_rate == rate
+    groups = make_agent(config, examine(config.env)).optimizer.param_groups
+    assert [group["lr"] for group in groups] == [1e-3 * rate, 1e-3]
+
+
+def test_what_is_scored_fits_into_the_buffer():
+    sweep = {"heads": 4, "batch_size": 8}  # draws 32
+    for given, capacity in (
+        ({"updates": 5}, 160),
+        ({"updates": 1, "scored_per_drawn": 2.5}, 80),
+        ({"updates": 5, "her_buffer_capacity": 40}, 40),
+    ):
+        assert settings.complete(Config(**sweep, **given)).her_buffer_capacity == capacity
+    for rate in (0.0, -1.0, math.nan, math.inf, 0.01):
+        with pytest.raises(UsageError, match="--scored-per-drawn must be"):
+            settings.complete(Config(**sweep, scored_per_drawn=rate))
+    with pytest.raises(UsageError, match="40 transitions are scored at once, and B_h holds 39"):
+        settings.complete(Config(**sweep, scored_per_drawn=1.25, her_buffer_capacity=39))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_a_missing_device_is_named():
+    with pytest.raises(UsageError, match="no CUDA device"):
+        settings.complete(Config(device="cuda"))
+    assert settings.complete(Config(device="auto")).device == "cpu"
+
+
+def test_a_missing_tensorboard_is_named(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UsageError, match="pip install tensorboard"):
+        settings.complete(Config(tensorboard=True))
