@@ -27,10 +27,10 @@ from vcp import value_consistency_priority
 SMALL = "epochs=2,cycles=1,updates=1,batch_size=16,eval_episodes=16"
 
 
-def make_run(folder, epochs=6, level=1.0, of=None, **settings):
+def make_run(folder, epochs=6, level=1.0, of=None, **given):
     """A run's files, in which the success rises by `level` to 1 at most. of: all its epochs, for a
     run that was stopped before."""
-    config = settings.complete(Config(**settings, epochs=of or epochs or 1))
+    config = settings.complete(Config(**given, epochs=of or epochs or 1))
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps({"config": asdict(config)}))
     with open(folder / "progress.csv", "w", newline="") as file:
@@ -101,7 +101,7 @@ def test_each_figure_has_its_runs(name, lines, results, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "settings, label",
+    "given, label",
     [
         ({"temperature": 1.0}, "VCP, temperature 1.0"),
         ({"buffer_size": 10_000}, "VCP, buffer_size 10000"),
@@ -113,8 +113,8 @@ def test_each_figure_has_its_runs(name, lines, results, monkeypatch):
         ({"trunk_rate": 0.0625}, "VCP, trunk_rate 0.0625"),
     ],
 )
-def test_the_label_names_what_is_not_the_default(settings, label):
-    assert figures.label(settings.complete(Config(**settings))) == label
+def test_the_label_names_what_is_not_the_default(given, label):
+    assert figures.label(settings.complete(Config(**given))) == label
 
 
 def test_figure_4(results):

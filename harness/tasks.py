@@ -191,33 +191,42 @@ def examine(name: str, episode_length: int | None = None) -> Task:
 def _what_is_wrong(env: gym.Env) -> str | None:
     horizon, rng = env.spec.max_episode_steps, np.random.default_rng(0)
     obs, _ = env.reset(seed=0)
-    goal, achieved, rewards = obs["desired_goal"].copy(), [], []
+    goal = obs["desired_goal"].copy()
     for t in range(1, horizon + 1):
         action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
         obs, reward, terminated, truncated, info = env.step(action)
-        achieved.append(obs["achieved_goal"].copy())
-        rewards.append(reward)
-        if not np.array_equal(obs["desired_goal"], goal):
-            return f"its goal moved in step {t}; it must stand still for an episode"
-        ended = how_it_ended(t, horizon, terminated, truncated, succeeded(reward, info))
-        if ended:
-            return ended
-    # As B_o stores them: float32, with the goal of the first observation.
-    stored = np.float32(achieved), np.tile(np.float32(goal), (horizon, 1))
-    recomputed = reward_of(env)(*stored)
-    differ = np.flatnonzero(recomputed != np.array(rewards))
-    if len(differ):
-        t = differ[0]
-        return (
-            f"step {t + 1} gave the reward {rewards[t]:g}, and compute_reward of what it observed"
-            f" gives {recomputed[t]:g} (a wrapper that changes goals or rewards needs a"
-            " compute_reward of its own)"
+        problem = disagreement(env, t, goal, obs, reward, np.float32)  # as B_o stores them
+        problem = problem or how_it_ended(
+            t, horizon, terminated, truncated, succeeded(reward, info)
         )
-    if max(np.abs(stored[0]).max(), np.abs(stored[1]).max()) > CLIP:
-        return (
-            f"its goals lie beyond ±{CLIP}, where the networks see no difference: use other units"
-        )
+        if problem:
+            return problem
+        if np.abs([goal, obs["achieved_goal"]]).max() > CLIP:
+            return f"its goals lie beyond ±{CLIP}, all the same to the networks: use other units"
     return None
+
+
+def disagreement(env: gym.Env, t: int, goal, obs: dict, reward: float, dtype=None) -> str | None:
+    """How step t differs from what replay will make of it: the goal of the first observation is not
+    `goal` any more, or compute_reward does not give the step's reward. None if all is well."""
+    if not np.array_equal(obs["desired_goal"], goal):
+        return f"its goal moved in step {t}; it must stand still for an episode"
+    if _pen(env):
+        return None
+    pairs = (np.asarray([x, x], dtype) for x in (obs["achieved_goal"], goal))
+    again = reward_of(env)(*pairs)[0]
+    if again == reward:
+        return None
+    return (
+        f"step {t} gave the reward {reward:g}, and compute_reward of what it observed gives"
+        f" {again:g} (a wrapper that changes goals or rewards needs a compute_reward of its own)"
+    )
+
+
+def _pen(env: gym.Env) -> bool:
+    """Whether it is a Pen task, whose compute_reward gives something else for a batch than for a
+    pair, in gymnasium-robotics as in the gym of the paper (NOTES.md, "The Pen tasks' reward")."""
+    return getattr(env.unwrapped, "ignore_z_target_rotation", False)
 
 
 def succeeded(reward: float, info: dict) -> bool:
@@ -242,6 +251,8 @@ def _describe(name: str, env: gym.Env) -> str:
     made, steps = PAPER_ENVS.get(name, name), f"{env.spec.max_episode_steps} steps an episode"
     if isinstance(env, MinusOne):
         steps += "; its rewards of 0 and 1 count as -1 and 0"
+    if _pen(env):
+        steps += "; what it rewards in replay is not quite what it tests: NOTES.md"
     if name not in PAPER_ENVS:
         return f"{name}: {steps}"
     if made.startswith("PointMass"):

@@ -30,7 +30,7 @@ def modules() -> dict[str, Path]:
     files = [HERE / f"{name}.py" for name in CORE]
     files += [file for room in ROOMS for file in (HERE / room).glob("*.py")]
     names = [".".join(file.relative_to(HERE).with_suffix("").parts) for file in files]
-    tests = ("test_", "testing")
+    tests = ("test_", "testing", "conftest")
     pairs = zip(names, files, strict=True)
     return {n: f for n, f in pairs if not n.split(".")[-1].startswith(tests) and "__" not in n}
 

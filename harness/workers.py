@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from harness.errors import EnvironmentFailed
-from harness.tasks import KEYS, how_it_ended, make_env, succeeded
+from harness.tasks import KEYS, disagreement, how_it_ended, make_env, succeeded
 
 MakeEnv = Callable[[], gym.Env]
 
@@ -50,7 +50,8 @@ class EnvGroup(gym.Env):
     """Several environments as one: its observations and actions have a first axis over them.
 
     Nothing is reset by itself: episodes have a fixed length, and one that ends with success is
-    played on. EnvironmentFailed for one that ends otherwise, and for what an environment raises.
+    played on. EnvironmentFailed for one that ends otherwise, for a last step whose goal or reward
+    is not what replay will make of it, and for what an environment raises.
 
     main: the main process's id, for a group that lives in another; there Ctrl-C is ignored and, if
     `core` is given, that is the one processor that the process may use.
@@ -76,18 +77,22 @@ class EnvGroup(gym.Env):
         self.t = 0
         seeds = [None if seed is None else seed + i for i in range(len(self.envs))]
         pairs = zip(self.envs, seeds, strict=True)
-        return self._stack([self._ask(env.reset, seed=s)[0] for env, s in pairs]), {}
+        observations = [self._ask(env.reset, seed=s)[0] for env, s in pairs]
+        self.goals = [obs["desired_goal"].copy() for obs in observations]
+        return self._stack(observations), {}
 
     def step(self, action):
         self.t += 1
         observations, success = [], []
-        for env, its_action in zip(self.envs, action, strict=True):
+        for env, its_action, goal in zip(self.envs, action, self.goals, strict=True):
             obs, reward, terminated, truncated, info = self._ask(env.step, its_action)
             observations.append(obs)
             success.append(succeeded(reward, info))
-            ended = how_it_ended(self.t, self.horizon, terminated, truncated, success[-1])
-            if ended:
-                raise EnvironmentFailed(f"{env.spec.id}: {ended}")
+            problem = how_it_ended(self.t, self.horizon, terminated, truncated, success[-1])
+            if self.t == self.horizon:
+                problem = self._ask(disagreement, env, self.t, goal, obs, reward)
+            if problem:
+                raise EnvironmentFailed(f"{env.spec.id}: {problem}")
         return self._stack(observations), 0.0, False, False, {"is_success": np.array(success)}
 
     def close(self):
