@@ -3,6 +3,7 @@
 import contextlib
 import difflib
 import io
+import itertools
 from dataclasses import dataclass
 
 import gymnasium as gym
@@ -44,6 +45,7 @@ MISSPELT = {  # as Appendix A prints two of them
 
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
+MOST_LOOKED_AT = 8  # episodes, by `examine`
 CLIP = 200  # what lies beyond is one and the same to the networks (ensemble.Normalizer)
 
 
@@ -103,7 +105,7 @@ def make_env(name: str, episode_length: int | None = None, **kwargs) -> gym.Env:
     try:
         problem = _what_is_missing(env)
     except Exception as error:
-        problem = f"its reset or compute_reward raised {_said(error)}"
+        problem = f"its reset raised {_said(error)}"
     if problem:
         env.close()
         raise UsageError(f"cannot learn in the environment {name}: {problem}")
@@ -116,7 +118,7 @@ def _said(error: Exception) -> str:
     """An error in one line."""
     message = " ".join(str(error).split()).rstrip(".")
     expected = isinstance(error, (gym.error.Error, ModuleNotFoundError))
-    return message if expected else f"{type(error).__name__}: {message}"
+    return message if expected else f"{type(error).__name__}: {message}".rstrip(": ")
 
 
 def _what_is_missing(env: gym.Env) -> str | None:
@@ -142,7 +144,10 @@ def _what_is_missing(env: gym.Env) -> str | None:
     for key in KEYS:
         if np.shape(obs[key]) != space[key].shape:
             return f"its {key} is {np.shape(obs[key])}, its space says {space[key].shape}"
-    rewards = _three_rewards(env)
+    try:
+        rewards = _three_rewards(env)
+    except Exception as error:
+        return f"its compute_reward does not take a batch of goals and no info ({_said(error)})"
     if rewards.shape != (3,):
         return f"its compute_reward is not vectorised: 3 pairs of goals gave {rewards.shape}"
     if rewards[0] not in (0, 1) or not np.isin(rewards, (rewards[0] - 1, rewards[0])).all():
@@ -162,10 +167,11 @@ def _three_rewards(env: gym.Env) -> np.ndarray:
 
 
 def examine(name: str, episode_length: int | None = None) -> Task:
-    """Make the environment and play an episode of random actions in it. UsageError, one line, as in
-    `make_env` and for what would be learned wrongly without a word: another reward in `step` than
-    `compute_reward` gives for what is stored, a goal that moves, an end before the last step that
-    is not a success, goals beyond the networks' clip of ±200."""
+    """Make the environment and play an episode of random actions in it, and some more as long as
+    the goal has not been reached in any. UsageError, one line, as in `make_env` and for what would
+    be learned wrongly without a word: another reward in `step` than `compute_reward` gives for what
+    is stored, a goal that moves, an end before the last step that is not a success, goals beyond
+    the networks' clip of ±200."""
     env = make_env(name, episode_length)
     try:
         problem = _what_is_wrong(env)
@@ -189,12 +195,15 @@ def examine(name: str, episode_length: int | None = None) -> Task:
 
 
 def _what_is_wrong(env: gym.Env) -> str | None:
-    horizon, rng = env.spec.max_episode_steps, np.random.default_rng(0)
-    obs, _ = env.reset(seed=0)
-    goal = obs["desired_goal"].copy()
-    for t in range(1, horizon + 1):
+    horizon, rng, reached = env.spec.max_episode_steps, np.random.default_rng(0), False
+    for episode, t in itertools.product(range(MOST_LOOKED_AT), range(1, horizon + 1)):
+        if t == 1:
+            if reached:
+                break
+            goal = env.reset(seed=episode)[0]["desired_goal"].copy()
         action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
         obs, reward, terminated, truncated, info = env.step(action)
+        reached = reached or reward == 0
         problem = disagreement(env, t, goal, obs, reward, np.float32)  # as B_o stores them
         problem = problem or how_it_ended(
             t, horizon, terminated, truncated, succeeded(reward, info)
@@ -218,8 +227,8 @@ def disagreement(env: gym.Env, t: int, goal, obs: dict, reward: float, dtype=Non
     if again == reward:
         return None
     return (
-        f"step {t} gave the reward {reward:g}, and compute_reward of what it observed gives"
-        f" {again:g} (a wrapper that changes goals or rewards needs a compute_reward of its own)"
+        f"step {t} gave the reward {reward + 0:g}, and compute_reward of what it observed gives"
+        f" {again + 0:g} (a wrapper that changes either needs a compute_reward of its own)"
     )
 
 
