@@ -4,8 +4,8 @@ Letters in the shape comments:
     K heads    B transitions    E rows for each head    I inputs
     O observation    G goal    A action    H = 256 units of a hidden layer
 
-Nothing here knows about priorities: a mini-batch comes in with a weight for each transition, and
-the variance of the Q-values goes out. The prioritisation is in vcp.py.
+A mini-batch comes in with a weight for each transition, the variance of the Q-values goes out; the
+prioritisation is in vcp.py.
 """
 
 import copy
@@ -38,7 +38,7 @@ class MultiHeadMLP:
     squash: applied to the output; torch.tanh for the actor, None for the critic.
     """
 
-    def __init__(self, inputs, outputs, heads, squash, generator, device="cpu"):
+    def __init__(self, inputs, outputs, heads, generator, device="cpu", squash=None):
         def xavier(*shape):  # U(-√(6/(I+J)), √(6/(I+J)))
             bound = (6 / (shape[-1] + shape[-2])) ** 0.5
             return torch.empty(shape).uniform_(-bound, bound, generator=generator).to(device)
@@ -77,8 +77,8 @@ class MultiHeadMLP:
 
 
 class Normalizer:
-    """Running mean and standard deviation of [observation | goal], as HER's published code has it
-    (not in the paper): clip to ±200, standardise (std at least 0.01), clip to ±5."""
+    """Running mean and standard deviation of [observation | goal], not in the paper but in HER's
+    code: clip to ±200, standardise (std at least 0.01), clip to ±5."""
 
     def __init__(self, dim: int, device="cpu"):
         self.count = 0
@@ -93,22 +93,22 @@ class Normalizer:
         self.count += len(x)
         self.sum += x.sum(axis=0)
         self.sum_of_squares += np.square(x).sum(axis=0)
+        self._follow()
+
+    def _follow(self) -> None:
         mean = self.sum / self.count
         variance = self.sum_of_squares / self.count - mean**2
         self.mean.copy_(torch.from_numpy(mean))
         self.std.copy_(torch.from_numpy(np.sqrt(np.maximum(variance, 0.01**2))))
 
     def state_dict(self) -> dict:
-        sums = {"sum": self.sum, "sum_of_squares": self.sum_of_squares}
-        tensors = {name: torch.from_numpy(x) for name, x in sums.items()}
-        return {"count": self.count, "mean": self.mean, "std": self.std, **tensors}
+        sums = (torch.from_numpy(x) for x in (self.sum, self.sum_of_squares))
+        return {"count": self.count, "sums": tuple(sums)}
 
     def load_state_dict(self, state: dict) -> None:
         self.count = state["count"]
-        self.mean.copy_(state["mean"])
-        self.std.copy_(state["std"])
-        self.sum = state["sum"].numpy()
-        self.sum_of_squares = state["sum_of_squares"].numpy()
+        self.sum, self.sum_of_squares = (x.numpy() for x in state["sums"])
+        self._follow()
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         return ((x.clamp(-200, 200) - self.mean) / self.std).clamp(-5, 5)
@@ -147,31 +147,23 @@ class EnsembleDDPG:
         generator = torch.Generator().manual_seed(seed)
         state = obs_dim + goal_dim
 
-        def actor():
-            return MultiHeadMLP(state, action_dim, heads, torch.tanh, generator, device)
-
-        def critic():
-            return MultiHeadMLP(state + action_dim, 1, heads, None, generator, device)
-
+        common = (heads, generator, device)
+        actor = partial(MultiHeadMLP, state, action_dim, *common, squash=torch.tanh)
+        critic = partial(MultiHeadMLP, state + action_dim, 1, *common)
         self.actor, self.critic = actor(), critic()
         self.target_actor, self.target_critic = actor(), critic()
         self._move_targets(trunk_step=1.0, head_step=1.0)  # targets start as copies
+        self._networks = [self.actor, self.critic, self.target_actor, self.target_critic]
         self._frozen_critic = copy.deepcopy(self.critic)
         self.normalizer = Normalizer(state, device)
 
-        # One Adam for everything; it passes over the heads that are not updated, which have no
-        # gradient. With an Adam for each head, each with moments of its own for the trunks, as in
-        # the released code, the trunks die (NOTES.md, "the trunks' Adam").
+        # One Adam for everything; it passes over heads without a gradient, those not updated. With
+        # one for each head, as in the released code, the trunks die (NOTES.md, "the trunks' Adam").
         nets = (self.actor, self.critic)
-        for net in nets:
-            for p in net.parameters():
-                p.requires_grad_()
-        trunks = [p for net in nets for p in net.trunk]
-        own = [p for net in nets for p in net.parameters()[4:]]
+        trunks = [p.requires_grad_() for net in nets for p in net.trunk]
+        own = [p.requires_grad_() for net in nets for p in net.parameters()[4:]]
         rates = [{"params": trunks, "lr": learning_rate * trunk_rate}, {"params": own}]
         self.optimizer = torch.optim.Adam(rates, learning_rate, fused=True)
-
-    # ---------------------------------------------------------------- acting and scoring
 
     @torch.no_grad()
     def act(self, obs: np.ndarray, goal: np.ndarray, heads: slice = slice(None)) -> np.ndarray:
@@ -204,8 +196,6 @@ class EnsembleDDPG:
         state_action = torch.cat([self._state(obs, goal), self._tensor(action)], -1)
         q = critic.all_heads(state_action).squeeze(-1)  # (K, B)
         return q.var(dim=0, correction=0).cpu().numpy()
-
-    # ---------------------------------------------------------------- learning
 
     def update_head(self, k: int, batch: dict[str, np.ndarray]) -> torch.Tensor:
         """Algorithm 2, line 16: one DDPG step of head k, Eqs. (2) and (3), conditioned on goals.
@@ -245,10 +235,9 @@ class EnsembleDDPG:
     def update_targets(self) -> None:
         """θ̄ <- polyak·θ̄ + (1 - polyak)·θ, once a cycle FOR EACH HEAD's target network.
 
-        Not in the paper, which says 0.95 and that each head has its own target network; the
-        released code does so. A head's network is its head and the trunk, so the trunk is averaged
-        K times; the main trunk stands still meanwhile, and K steps of 0.95 are one step of 0.95^K.
-        What a single step for the trunk changes is in NOTES.md, "the trunk's targets".
+        Not in the paper; the released code does so. A head's network is its head and the trunk, so
+        the trunk is averaged K times, and K steps of 0.95 are one step of 0.95^K (NOTES.md, "the
+        trunk's targets").
         """
         trunk_step = 1 - self.polyak**self.heads
         self._move_targets(trunk_step, head_step=1 - self.polyak)
@@ -259,15 +248,10 @@ class EnsembleDDPG:
             torch._foreach_lerp_(target.trunk, net.trunk, trunk_step)
             torch._foreach_lerp_(target.heads, net.heads, head_step)
 
-    # ---------------------------------------------------------------- checkpoints
-
-    def _networks(self) -> list[MultiHeadMLP]:
-        return [self.actor, self.critic, self.target_actor, self.target_critic]
-
     def state_dict(self) -> dict:
         """Networks, targets, the optimiser's moments and the normaliser, as tensors."""
         return {
-            "networks": [[p.detach() for p in net.trunk + net.heads] for net in self._networks()],
+            "networks": [[p.detach() for p in net.trunk + net.heads] for net in self._networks],
             "optimizer": self.optimizer.state_dict(),
             "normalizer": self.normalizer.state_dict(),
         }
@@ -275,13 +259,11 @@ class EnsembleDDPG:
     @torch.no_grad()
     def load_state_dict(self, state: dict) -> None:
         """Take over a `state_dict` of an agent of the same sizes."""
-        for net, saved in zip(self._networks(), state["networks"], strict=True):
+        for net, saved in zip(self._networks, state["networks"], strict=True):
             for p, value in zip(net.trunk + net.heads, saved, strict=True):
                 p.copy_(value)
         self.optimizer.load_state_dict(state["optimizer"])
         self.normalizer.load_state_dict(state["normalizer"])
-
-    # ---------------------------------------------------------------- NumPy to network
 
     def _tensor(self, x: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(x, dtype=torch.float32, device=self.device)

@@ -1,8 +1,8 @@
-"""The environments of Appendix A that are ours: PointMass and the sparse Reacher.
+"""The environments of Appendix A that are ours: PointMass and the sparse Reacher. Importing this
+module registers them with gymnasium. Lengths are in metres.
 
 Goal environments: the observation is a dict of "observation", "achieved_goal" and "desired_goal",
 and `compute_reward(achieved, desired, info)` is Eq. (1): 0 where the goal is reached, else -1.
-Lengths are in metres; an episode has 50 steps. Importing this module registers them with gymnasium.
 """
 
 import math

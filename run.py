@@ -90,7 +90,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                     if her_buffer and not her_buffer.size:
                         # + so that there is something to draw: once, as much as B_o holds
                         first = min(original_buffer.size * horizon, her_buffer.capacity)
-                        scoring = (original_buffer, her_buffer, agent.q_variance, first)
+                        scoring = (her_buffer, original_buffer, agent.q_variance, first)
                         update_her_buffer(*scoring, *relabelling)
                     for _ in range(config.updates):  # + VCP+: 5 or 40 sweeps of the heads a cycle
                         if her_buffer:  # 13: in another thread, Algorithm 1, its lines 3-5

@@ -25,7 +25,7 @@ from torch import nn
 
 import envs_point
 import run
-from ensemble import HIDDEN, EnsembleDDPG, Normalizer
+from ensemble import HIDDEN, EnsembleDDPG, MultiHeadMLP, Normalizer
 from envs_point import CLEARANCE, REACH
 from harness import assemble
 from harness.records import COLUMNS
@@ -116,6 +116,22 @@ def test_her_buffer_is_first_in_first_out():
         buffer.add(transitions(range(6)), np.zeros(6))
 
 
+def test_her_buffer_refuses_what_it_cannot_use():
+    """A variance for each head instead of one for each transition, draws without priorities."""
+    buffer, rng = HERBuffer(8, temperature=1), np.random.default_rng(0)
+    for variance in (np.zeros((3, 1)), np.zeros(2), np.float64(1)):
+        with pytest.raises(ValueError, match="one number for each transition"):
+            buffer.add(transitions(range(3)), variance)
+    for values in ([0, 1, 2], [3, 4]):  # at first, and after new ones came
+        batch = {name: torch.from_numpy(x) for name, x in transitions(values).items()}
+        buffer.add(batch, torch.arange(float(len(values))))
+        with pytest.raises(ValueError, match="call update_priorities"):
+            buffer.sample(4, rng)
+        buffer.update_priorities()
+        assert buffer.sample(4, rng)["obs"].shape == (4, 2)
+    np.testing.assert_array_equal(buffer.data["variance"][:5], [0, 1, 2, 0, 1])
+
+
 @pytest.mark.parametrize("priority", ["consistency", "variance", "uniform"])
 def test_sampling_follows_the_priorities(priority):
     variance = np.array([0.0, 0.1, 0.2, 0.5, 0.9, 1.0])
@@ -190,7 +206,7 @@ def test_algorithm_1_scores_and_stores_what_it_drew():
     buffer = HERBuffer(100, temperature=9)
     for _ in range(2):
         how = (agent.q_variance, 40, np.random.default_rng(1), 0.8, exact_reward)
-        update_her_buffer(original, buffer, *how)
+        update_her_buffer(buffer, original, *how)
     assert buffer.size == 80
     rows = {name: x[:80] for name, x in buffer.data.items()}
     expected = agent.q_variance(rows["obs"], rows["action"], rows["goal"])
@@ -429,6 +445,22 @@ def test_networks_have_the_papers_size_and_start_like_their_targets():
     other = EnsembleDDPG(10, 3, 4, gamma=0.98, seed=1)
     assert torch.equal(agent.actor.heads[0], again.actor.heads[0])
     assert not torch.equal(agent.actor.heads[0], other.actor.heads[0])
+
+
+def test_a_head_is_trained_through_its_network_with_any_optimiser():
+    """What one copies: `net(k, x)` and `net.parameters()`; `all_heads` sees what was learned."""
+    net = MultiHeadMLP(3, 2, 4, torch.Generator().manual_seed(0))
+    optimizer = torch.optim.SGD([p.requires_grad_() for p in net.parameters()], lr=0.1)
+    x = torch.randn(6, 3, generator=torch.Generator().manual_seed(1))
+    before = net.all_heads(x)
+    net(2, x).square().mean().backward()
+    optimizer.step()
+    after = net.all_heads(x)
+    torch.testing.assert_close(after[2], net(2, x).detach())
+    assert after[2].square().mean() < before[2].square().mean()
+    assert not after.requires_grad and not net(2, x, frozen=True).requires_grad
+    own = [torch.equal(p, q) for p, q in zip(net.own[0], net.own[2], strict=True)]
+    assert len(net.parameters()) == 4 + 4 * 4 and not own[0]
 
 
 @pytest.mark.parametrize("trunk_rate", [1, 0.25])
@@ -769,10 +801,10 @@ def test_train_does_what_algorithm_2_says(acting_head, collecting, tmp_path, mon
             frozen.append(copy.deepcopy(self))
             return super().frozen_q_variance()
 
-    def spy_on_the_first(original_buffer, her_buffer, q_variance, size, *args):
+    def spy_on_the_first(her_buffer, original_buffer, q_variance, size, *args):
         calls.append(("first", size))
         assert size == min(original_buffer.size * 50, her_buffer.capacity)
-        return update_her_buffer(original_buffer, her_buffer, q_variance, size, *args)
+        return update_her_buffer(her_buffer, original_buffer, q_variance, size, *args)
 
     def spy_score(original_buffer, q_variance, size, *args):
         """Lines 3-5, slowed down until the heads have moved on."""

@@ -62,11 +62,7 @@ class HERBuffer:
     """
 
     def __init__(
-        self,
-        capacity: int,
-        temperature: float,
-        priority: str = "consistency",
-        importance: str = "paper",
+        self, capacity: int, temperature: float, priority="consistency", importance="paper"
     ):
         self.capacity, self.temperature = capacity, temperature
         self._priority, self._importance = PRIORITIES[priority], IMPORTANCE[importance]
@@ -138,9 +134,8 @@ def score(
 ) -> tuple[Batch, np.ndarray]:
     """Algorithm 1, lines 3-5. Returns a mini-batch (`relabel_future`) and its variances (B,).
 
-    It changes nothing, so it can run in a thread of its own while the heads are trained, as
-    Algorithm 2, line 13, has it, if q_variance belongs to critics that stand still:
-    `EnsembleDDPG.frozen_q_variance`.
+    It changes nothing, so another thread can do it while the heads are trained, as Algorithm 2,
+    line 13, has it, with critics that stand still: `EnsembleDDPG.frozen_q_variance`.
     """
     # 3-4: a mini-batch of B_o, its goals relabelled by 'future'
     batch = relabel_future(original_buffer.episodes, batch_size, rng, relabel_ratio, reward_fn)
@@ -148,19 +143,8 @@ def score(
     return batch, q_variance(batch["obs"], batch["action"], batch["goal"])
 
 
-def update_her_buffer(
-    original_buffer: EpisodeBuffer,
-    her_buffer: HERBuffer,
-    q_variance: QVariance,
-    batch_size: int,
-    rng: np.random.Generator,
-    relabel_ratio: float,
-    reward_fn: RewardFn,
-) -> None:
-    """Algorithm 1, lines 3-7, once, for a mini-batch of `batch_size` transitions.
-    ValueError if it exceeds the capacity of B_h."""
-    batch, variance = score(
-        original_buffer, q_variance, batch_size, rng, relabel_ratio, reward_fn
-    )  # 3-5
-    her_buffer.add(batch, variance)  # 6
+def update_her_buffer(her_buffer: HERBuffer, *drawing) -> None:
+    """Algorithm 1, lines 3-7, once. drawing: the arguments of `score`.
+    ValueError if the mini-batch exceeds the capacity of B_h."""
+    her_buffer.add(*score(*drawing))  # 3-6
     her_buffer.update_priorities()  # 7

@@ -75,7 +75,7 @@ def test_vcp_without_prioritization_samples_like_her():
 
     agent = EnsembleDDPG(2, 2, 2, gamma=0.98, heads=2)
     her_buffer = HERBuffer(300_000, temperature=9, priority="uniform")
-    update_her_buffer(buffer, her_buffer, agent.q_variance, 300_000, rng, 0.8, exact_reward)
+    update_her_buffer(her_buffer, buffer, agent.q_variance, 300_000, rng, 0.8, exact_reward)
     drawn = her_buffer.sample(30_000, rng)
     assert_frequencies(*hindsight_frequencies(drawn, n, horizon))
     np.testing.assert_allclose(drawn["weight"], 1, rtol=1e-6)

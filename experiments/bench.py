@@ -207,7 +207,7 @@ def bench_algorithm_1(repeats: int, heads: int = 16) -> None:
         her_buffer, reward_fn = replay_of(complete(Config(env=name, heads=heads)), original)
         how = (heads * size, np.random.default_rng(1), 0.8, reward_fn)
         while her_buffer.size < her_buffer.capacity:
-            update_her_buffer(original, her_buffer, agent.q_variance, *how)
+            update_her_buffer(her_buffer, original, agent.q_variance, *how)
 
         def train(agent=agent, her_buffer=her_buffer, rng=rng):
             for k in range(heads):
@@ -219,7 +219,7 @@ def bench_algorithm_1(repeats: int, heads: int = 16) -> None:
             her_buffer.add(*scoring.result())
             her_buffer.update_priorities()
 
-        def in_turn_with_it(agent=agent, buffers=(original, her_buffer), how=how, train=train):
+        def in_turn_with_it(agent=agent, buffers=(her_buffer, original), how=how, train=train):
             update_her_buffer(*buffers, agent.q_variance, *how)
             train()
 

@@ -54,7 +54,7 @@ def drawn(its: Parts, method: str, rng: np.random.Generator) -> dict[str, np.nda
     if method == "vcp":
         how = (its.agent.q_variance, SCORED, rng, config.relabel_ratio, its.task.reward_fn)
         for _ in range(replay.capacity // SCORED):
-            update_her_buffer(its.original_buffer, replay, *how)
+            update_her_buffer(replay, its.original_buffer, *how)
     else:
         replay.new_episodes(np.arange(its.original_buffer.size))
     batches = [replay.sample(config.batch_size, rng) for _ in range(BATCHES)]

@@ -234,7 +234,7 @@ def test_the_shares_by_weight():
 
 
 def test_dead_units(tmp_path, capsys):
-    net = MultiHeadMLP(3, 2, 2, torch.tanh, torch.Generator().manual_seed(0))
+    net = MultiHeadMLP(3, 2, 2, torch.Generator().manual_seed(0), squash=torch.tanh)
     net.heads[1][0, :64] = -1e6  # a quarter of one of two heads
     net.trunk[3][:32] = -1e6
     embedding, units = inspect_run.hidden(net, torch.randn(50, 3))

@@ -90,7 +90,7 @@ shapes["action"] = (4, 10, 2)
 original_buffer.add({name: rng.normal(size=shape) for name, shape in shapes.items()}, rng)
 agent = EnsembleDDPG(3, 2, 2, gamma=0.9, heads=4)
 reward_fn = lambda a, b: -1.0 * (np.linalg.norm(a - b, axis=-1) > 0.1)
-update_her_buffer(original_buffer, her_buffer, agent.q_variance, 300, rng, 0.8, reward_fn)
+update_her_buffer(her_buffer, original_buffer, agent.q_variance, 300, rng, 0.8, reward_fn)
 print(agent.update_head(2, her_buffer.sample(64, rng)).isfinite().all().item())
 """
     assert python(program, tmp_path) == "True\n"

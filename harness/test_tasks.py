@@ -130,7 +130,7 @@ def test_one_cycle_of_each_of_the_sixteen(name):
     def reward_fn(achieved, desired):
         return env.unwrapped.compute_reward(achieved, desired, {})
 
-    update_her_buffer(original, buffer, agent.q_variance, 256, rng, 0.8, reward_fn)
+    update_her_buffer(buffer, original, agent.q_variance, 256, rng, 0.8, reward_fn)
     rewards = buffer.data["reward"]
     assert set(np.unique(rewards)) == {-1.0, 0.0} and rewards.dtype == np.float32
     for k in range(2):
