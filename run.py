@@ -53,10 +53,13 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     test_rounds = math.ceil(config.eval_episodes / num_envs)
 
     folder, began = Path(config.out), time.perf_counter()
-    rows = records.restore(folder, its.state()) if resume else []
+    rows = records.restore(folder, asdict(config), its.state()) if resume else []
     began -= rows[-1]["wall_seconds"] if rows else 0
-    with its.envs() as envs, ThreadPoolExecutor(1) as thread:
-        records.start(folder, asdict(config), rows, resume)
+    with (
+        its.envs() as envs,
+        records.held(folder, asdict(config), rows, resume),
+        ThreadPoolExecutor(1) as thread,
+    ):
         print(its.task.made)
         for epoch in range(len(rows) + 1, config.epochs + 1):  # 2: M epochs
             seeds = np.random.SeedSequence([config.seed, epoch])

@@ -16,7 +16,7 @@ from experiments import didactic, figures, inspect_run, sweep
 from harness import settings
 from harness.assemble import restored
 from harness.errors import UsageError
-from harness.records import COLUMNS, epochs_done, load_checkpoint
+from harness.records import COLUMNS, epochs_done, read_checkpoint
 from harness.settings import METHODS, Config
 from harness.tasks import examine
 from harness.testing import without_timing
@@ -211,7 +211,7 @@ def test_what_each_method_replays(tmp_path, capsys):
 
     sweep.main(arguments(tmp_path, "--task", "0"))
     folder = folder_of(tmp_path)
-    (whole, _), saved = restored(folder), load_checkpoint(folder)["parts"]
+    (whole, _), saved = restored(folder), read_checkpoint(folder / "checkpoint.pt")["parts"]
     for part, state in zip(whole.state(), saved, strict=True):
         torch.testing.assert_close(part.state_dict(), state, rtol=0, atol=0)
     inspect_run.main(["replayed", str(folder)])

@@ -1,7 +1,7 @@
 """A run's parts, made from its settings: Algorithm 2, line 1."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -104,9 +104,9 @@ def make_replay(
 def restored(folder: Path) -> tuple[Parts, list[dict]]:
     """The parts of the run in `folder` after its last whole epoch, and its rows. A run from a GPU
     can be restored without one. UsageError if there is none."""
-    config = settings.replace(settings.load(folder), device="auto", tensorboard=False)
+    config = replace(settings.load(folder), device="auto", tensorboard=False)
     parts = assemble(settings.complete(config))
-    rows = records.restore(folder, parts.state())
+    rows = records.restore(folder, asdict(parts.config), parts.state())
     if not rows:
         raise UsageError(f"the run in {folder} has no whole epoch yet")
     return parts, rows

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import os
+import signal
 import sys
 from collections.abc import Callable
 from dataclasses import fields
@@ -20,6 +21,9 @@ def main(train: Callable, argv: list[str] | None = None) -> None:
     """Train, resume or play, as the arguments say. Exit code 2 and one line for bad input, 1 and
     one line for a run that something outside the program stopped, 130 for Ctrl-C."""
     sys.path.append(os.getcwd())  # for the user's own module:ID
+    for name in ("SIGTERM", "SIGHUP"):  # as Ctrl-C
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.default_int_handler)
     given, command = parse(argv)
     try:
         if command.play is not None:
@@ -49,7 +53,8 @@ def stopped(folder: Path, error: BaseException) -> NoReturn:
     with."""
     done = records.epochs_done(folder)
     reason = f": {error}" if str(error) else ""
-    way_on = f"; to go on: python run.py --resume {folder}" if done else ""
+    saved = (folder / records.CHECKPOINT).exists()
+    way_on = f"; to go on: python run.py --resume {folder}" if saved else ""
     print(f"run.py: stopped in epoch {done + 1}{reason}{way_on}", file=sys.stderr)
     sys.exit(130 if isinstance(error, KeyboardInterrupt) else 1)
 

@@ -10,10 +10,10 @@ import io
 import json
 import math
 import os
-import pickle
 import platform
 import subprocess
 import time
+import zipfile
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 from tqdm.auto import tqdm
 
 from harness.errors import UsageError
@@ -47,6 +48,7 @@ TIMING_COLUMNS = {name for name in COLUMNS if name.endswith("_seconds")}
 PACKAGES = ("numpy", "torch", "gymnasium", "gymnasium-robotics", "mujoco")
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
 FORMAT = 3  # of checkpoints; others are refused
+MAY_CHANGE = ("epochs", "out", "device", "num_workers", "tensorboard")  # when a run is resumed
 
 tqdm.monitor_interval = 0  # its watching thread would outlive a run
 
@@ -123,7 +125,7 @@ def variance_by_kind(agent, replay, most: int = 4096) -> dict[str, float]:
 
 def write_whole(path: Path, write) -> None:
     """Make the file at `path` what write(binary file) writes, all of it or nothing."""
-    temporary = path.with_name(path.name + ".tmp")
+    temporary = path.with_name(path.name + ".tmp")  # `held` leaves it to one process
     try:
         with open(temporary, "wb") as file:
             write(file)
@@ -150,25 +152,40 @@ def read_config(folder: Path) -> dict:
         raise UsageError(f"{folder} does not hold a run: no readable config.json") from error
 
 
-def start(folder: Path, config: dict, rows: list[dict], resume: bool) -> None:
-    """Make the run's folder, or with `resume` bring it to the state of the rows of its checkpoint.
-    A finished run's config.json keeps the commit and versions that made it. UsageError if the
-    folder holds a run that is not resumed, or cannot be written to."""
-    if not resume and (folder / "config.json").exists():
-        raise UsageError(f"{folder} already holds a run: --resume it, or choose another --out")
+@contextmanager
+def held(folder: Path, config: dict, rows: list[dict], resume: bool) -> Iterator[None]:
+    """The run's folder, this process's alone in the block. It is made, or with `resume` brought to
+    the state of the rows of its checkpoint; a finished run's config.json keeps the commit and
+    versions that made it. UsageError if the folder holds a run that is not resumed, if another
+    process has it, or if it cannot be written to."""
+    lock = FileLock(folder / ".lock", timeout=0)  # any death of the process releases it
     try:
+        _refuse_another(folder, resume)
         folder.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except Timeout as error:
+        raise UsageError(f"another process trains in {folder}") from error
+    except OSError as error:
+        raise UsageError(f"cannot write to {folder}: {error.strerror or error}") from error
+    try:
+        _refuse_another(folder, resume)  # one that was faster
         if len(rows) < config["epochs"]:
             write_config(folder, config)
         write_rows(folder, rows, config)
-    except OSError as error:
-        raise UsageError(f"cannot write to {folder}: {error.strerror}") from error
+        yield
+    finally:
+        lock.release()
+
+
+def _refuse_another(folder: Path, resume: bool) -> None:
+    if not resume and (folder / "config.json").exists():
+        raise UsageError(f"{folder} already holds a run: --resume it, or choose another --out")
 
 
 def save(folder: Path, config: dict, rows: list[dict], parts: tuple) -> None:
     """The end of an epoch: checkpoint.pt, then progress.csv and curve.png."""
-    state = {"rows": rows, "parts": [part.state_dict() for part in parts]}
-    save_checkpoint(folder, state)
+    states = [part.state_dict() for part in parts]
+    save_checkpoint(folder, {"config": config, "rows": rows, "parts": states})
     write_rows(folder, rows, config)
 
 
@@ -212,33 +229,44 @@ def save_checkpoint(folder: Path, state: dict) -> None:
     os.replace(folder / "checkpoint.new.pt", path)
 
 
-def load_checkpoint(folder: Path) -> dict | None:
-    """The newest readable checkpoint; None if the run has none yet. UsageError if none is whole, or
-    if it is another version's."""
+def read_checkpoint(path: Path) -> dict:
+    """A checkpoint, all of it as it was written. It cannot run code. UsageError for one of another
+    version; any other error for one that is damaged, down to a single bit."""
+    with zipfile.ZipFile(path) as archive:  # PyTorch does not look at the checksums
+        if archive.testzip() is not None:
+            raise zipfile.BadZipFile("wrong checksum")
+    saved = torch.load(path, map_location="cpu", weights_only=True)
+    if saved.get("format") != FORMAT:
+        raise UsageError(f"{path} is a checkpoint of another version")
+    if not all(p.isfinite().all() for net in saved["parts"][0]["networks"] for p in net):
+        raise FloatingPointError("NaN or Inf in its networks")
+    return saved
+
+
+def restore(folder: Path, config: dict, parts: tuple) -> list[dict]:
+    """Bring the parts to the state of the newest checkpoint that is whole. Returns its rows, none
+    if there is no checkpoint yet. UsageError if none is whole, and for one of another version or of
+    other settings than `config`, those aside that a resumed run may change."""
     paths = [folder / name for name in ("checkpoint.new.pt", CHECKPOINT, PREVIOUS)]
     found = [path for path in paths if path.exists()]
     for path in found:
         try:
-            saved = torch.load(path, map_location="cpu", weights_only=True)
-        except (RuntimeError, EOFError, OSError, pickle.UnpicklingError) as error:
+            saved = read_checkpoint(path)
+            differ = [
+                k for k, v in saved["config"].items() if k not in MAY_CHANGE and config[k] != v
+            ]
+            if differ:
+                raise UsageError(f"{path} was made with another {differ[0]} than config.json says")
+            for part, state in zip(parts, saved["parts"], strict=True):
+                part.load_state_dict(state)
+            return saved["rows"]
+        except UsageError:
+            raise
+        except Exception as error:  # whatever a damaged file leads to
             print(f"{path} is damaged ({type(error).__name__}), trying the one before")
-            continue
-        if saved.get("format") != FORMAT:
-            raise UsageError(f"{path} is a checkpoint of another version")
-        return saved
     if found:
         raise UsageError(f"no checkpoint in {folder} can be read: they are damaged")
-    return None
-
-
-def restore(folder: Path, parts: tuple) -> list[dict]:
-    """Bring the parts to the state of the newest checkpoint. Returns its rows, none without one."""
-    saved = load_checkpoint(folder)
-    if saved is None:
-        return []
-    for part, state in zip(parts, saved["parts"], strict=True):
-        part.load_state_dict(state)
-    return saved["rows"]
+    return []
 
 
 def _write_tensorboard(folder: Path, rows: list[dict]) -> None:

@@ -12,6 +12,7 @@ import torch
 
 from harness import records
 from harness.errors import UsageError
+from harness.records import MAY_CHANGE
 from vcp import IMPORTANCE, PRIORITIES
 
 METHODS = ["vcp", "her", "herebp", "cher", "dtgsh"]
@@ -101,7 +102,6 @@ class Config:
 
 
 OF_VCP = ("temperature", "priority", "importance", "scored_per_drawn", "her_buffer_capacity")
-MAY_CHANGE = ("epochs", "out", "device", "num_workers", "tensorboard")  # when a run is resumed
 
 
 def paper_schedule(env: str, method: str = "vcp") -> dict[str, int]:

@@ -15,7 +15,7 @@ import pytest
 import envs_point
 import run
 from harness import records
-from harness.records import load_checkpoint
+from harness.records import read_checkpoint
 from harness.testing import ARGUMENTS, SMALL, command, finish, main, start
 from run import Config
 
@@ -29,7 +29,7 @@ def test_the_command_line_from_another_folder(tmp_path):
     folder = Path("runs", "PointMassEmptyEnv-v1", name, "seed0")
     assert out.splitlines()[-1].endswith(f"python run.py --play {folder}")
     folder = tmp_path / folder
-    files = {"config.json", "progress.csv", "curve.png", "checkpoint.pt"}
+    files = {"config.json", "progress.csv", "curve.png", "checkpoint.pt", ".lock"}
     assert files == {p.name for p in folder.iterdir()}
     settings = json.loads((folder / "config.json").read_text())
     assert settings["config"]["updates"] == 1 and settings["versions"]["mujoco"]
@@ -72,7 +72,7 @@ def test_nothing_is_left_running(sent, tmp_path):
     if sent == "worker":
         assert code == 1 and "died (exit code -9" in err and "PointMassEmptyEnv-v1" in err
         assert "Traceback" not in err
-    assert len(load_checkpoint(folder)["rows"]) >= 1
+    assert len(read_checkpoint(folder / "checkpoint.pt")["rows"]) >= 1
 
 
 class Hasty(envs_point.PointMass):
@@ -186,3 +186,54 @@ def test_help_names_every_option_and_default(capsys):
     ):
         assert name in text
     assert "𝒯 in Eq. (4)" in text and "(default: 9.0)" in text and "(default: 16)" in text
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_other_signals_end_a_run_as_ctrl_c_does(name, workers, tmp_path):
+    folder = tmp_path / "run"
+    arguments = [a for a in ARGUMENTS if "workers" not in a]
+    more = [f"--num-workers={workers}", "--epochs=1000", f"--out={folder}"]
+    process = start(*arguments, *more)
+    while not (folder / records.CHECKPOINT).exists() and process.poll() is None:
+        time.sleep(0.05)
+    its = children(process.pid)
+    os.killpg(process.pid, getattr(signal, name))
+    code, _, err = finish(process)
+    assert code == 130 and err.count("\n") == 1 and f"--resume {folder}" in err, err
+    assert gone(its)
+
+
+HANGS = """
+import sys, time, gymnasium, run
+from envs_point import PointMass
+class Hangs(PointMass):
+    steps = 0
+    def step(self, action):
+        self.steps += 1
+        while self.steps > 900:
+            time.sleep(1)
+        return super().step(action)
+gymnasium.register("Hangs-v0", Hangs, max_episode_steps=50)
+run.cli.main(run.train, sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_environment_that_hangs_is_left_by_one_ctrl_c(workers, tmp_path):
+    arguments = [a for a in ARGUMENTS if not a.startswith(("--env", "--num-workers"))]
+    more = ["--env=Hangs-v0", f"--num-workers={workers}", "--epochs=9", f"--out={tmp_path / 'r'}"]
+    process = start(*arguments, *more, program=HANGS)
+    time.sleep(8)
+    its = children(process.pid)
+    assert process.poll() is None
+    os.killpg(process.pid, signal.SIGINT)
+    process.communicate(timeout=20)
+    assert process.returncode == 130 and gone(its)
+
+
+def test_before_there_is_anything_to_go_on_with_the_line_does_not_say_so(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([*ARGUMENTS, "--epochs=1", "--learning-rate=1e30", f"--out={tmp_path / 'run'}"])
+    err = [line for line in capsys.readouterr().err.splitlines() if "run.py" in line]
+    assert stop.value.code == 1 and len(err) == 1 and "--resume" not in err[0]

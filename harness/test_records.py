@@ -7,15 +7,20 @@ aside, and the same weights.
 import multiprocessing
 import os
 import random
+import re
+import shutil
 import signal
 import threading
 import time
+import zipfile
+from pathlib import Path
 
 import pytest
 import torch
 
 import run
 from harness import records
+from harness.assemble import restored
 from harness.records import read_rows
 from harness.testing import ARGUMENTS, SMALL, assert_same_run, finish, main, start
 from run import Config
@@ -117,7 +122,7 @@ def test_killed_while_the_checkpoint_is_written(program, whole, tmp_path):
     main([f"--resume={folder}"])
     assert_same_run(whole, folder)
     assert {p.name for p in folder.iterdir()} == {
-        "config.json", "progress.csv", "curve.png", records.CHECKPOINT, records.PREVIOUS,
+        ".lock", "config.json", "progress.csv", "curve.png", records.CHECKPOINT, records.PREVIOUS,
     }  # fmt: skip
 
 
@@ -160,3 +165,88 @@ def test_a_checkpoint_of_another_version_is_refused(option, tmp_path, capsys):
         main([f"{option}={tmp_path}"])
     err = capsys.readouterr().err
     assert stop.value.code == 2 and "another version" in err and err.count("\n") == 1
+
+
+def test_a_flipped_bit_is_noticed(whole, tmp_path, capsys):
+    """At 50 places of a checkpoint, in its numbers and in what holds them together."""
+    folder = tmp_path / "run"
+    shutil.copytree(whole, folder)
+    path = folder / records.CHECKPOINT
+    bytes_, rng = path.read_bytes(), random.Random(0)
+    with zipfile.ZipFile(path) as archive:  # its alignment's padding holds nothing to be noticed
+        held = [(i.header_offset, i.file_size) for i in archive.infolist() if i.file_size > 100]
+    for _ in range(50):
+        offset, size = rng.choice(held)
+        place = offset + 128 + rng.randrange(size - 64)
+        path.write_bytes(bytes_[:place] + bytes([bytes_[place] ^ 1]) + bytes_[place + 1 :])
+        its, rows = restored(folder)
+        assert "is damaged" in capsys.readouterr().out and len(rows) == 3, place
+    assert its.config.heads == 2
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("nan", "NaN|damaged"),
+        ("parts", "damaged"),
+        ("size", "damaged"),
+        ("foreign", "damaged"),
+        ("pickle", "damaged"),
+        ("config", "was made with another temperature than config.json says"),
+    ],
+)
+def test_a_checkpoint_that_is_not_this_runs_is_not_trained_on(
+    what, message, whole, tmp_path, capsys
+):
+    folder = tmp_path / "run"
+    shutil.copytree(whole, folder)
+    (folder / records.PREVIOUS).unlink()
+    path, ran = folder / records.CHECKPOINT, tmp_path / "ran"
+    saved = records.read_checkpoint(path)
+    networks = saved["parts"][0]["networks"]
+    if what == "nan":
+        networks[0][0][0, 0] = float("nan")
+    elif what == "parts":
+        del saved["parts"][2]
+    elif what == "size":
+        networks[1] = [p[..., :-1] for p in networks[1]]
+    elif what == "foreign":
+        saved = {"weights": torch.zeros(3)}
+    elif what == "config":
+        text = (folder / "config.json").read_text()
+        (folder / "config.json").write_text(
+            text.replace('"temperature": 9.0', '"temperature": 5.0')
+        )
+    torch.save(saved if what != "pickle" else RunsCode(ran), path)
+    before = {p: p.stat().st_mtime_ns for p in folder.iterdir()}
+    for arguments in ([f"--resume={folder}", "--epochs=5"], [f"--play={folder}"]):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        out, err = capsys.readouterr()
+        assert stop.value.code == 2 and err.count("\n") == 1 and "Traceback" not in err
+        assert re.search(message, out + err) or (what == "foreign" and "another version" in err)
+    assert before == {p: p.stat().st_mtime_ns for p in folder.iterdir()} and not ran.exists()
+
+
+class RunsCode:
+    """A pickle that makes a file when it is loaded as pickles are."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_two_processes_in_one_folder(tmp_path):
+    """The second gets one line, whether the first has written already or not; the first goes on."""
+    folder = tmp_path / "run"
+    first = start(*ARGUMENTS, "--epochs=30", f"--out={folder}")
+    while not (folder / "config.json").exists() and first.poll() is None:
+        time.sleep(0.02)
+    for how in ([f"--resume={folder}"], [*ARGUMENTS, f"--out={folder}"]):
+        code, _, err = finish(start(*how, "--epochs=30"))
+        assert code == 2 and err.count("\n") == 1, err
+        assert "another process trains in" in err or "already holds a run" in err
+    assert finish(first)[0] == 0 and len(read_rows(folder)) == 30
+    main([f"--resume={folder}", "--epochs=31"])  # the lock is gone with its process

@@ -15,7 +15,7 @@ import torch
 import envs_point
 from ensemble import EnsembleDDPG
 from harness import cli, settings
-from harness.records import TIMING_COLUMNS, load_checkpoint, read_rows
+from harness.records import TIMING_COLUMNS, read_checkpoint, read_rows
 from run import train
 
 HERE = Path(__file__).parent.parent
@@ -186,7 +186,9 @@ def assert_same_run(a, b):
         for folder in (a, b)
     ]
     assert rows[0] == rows[1]
-    first, second = (tensors(load_checkpoint(folder)["parts"]) for folder in (a, b))
+    first, second = (
+        tensors(read_checkpoint(folder / "checkpoint.pt")["parts"]) for folder in (a, b)
+    )
     assert len(first) == len(second) > 100
     for x, y in zip(first, second, strict=True):
         assert torch.equal(x, y) if isinstance(x, torch.Tensor) else x == y

@@ -62,6 +62,9 @@ class EnvGroup(gym.Env):
         for_its_spaces = os.getpid() == main
         if main and not for_its_spaces:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)  # whose handler is the main process's
+            if hasattr(signal, "SIGHUP"):
+                signal.signal(signal.SIGHUP, signal.SIG_IGN)
             if core is not None:
                 os.sched_setaffinity(0, {core})
         self.envs = [read_joints_by_index(make()) for _ in range(1 if for_its_spaces else size)]
@@ -185,8 +188,13 @@ class ParallelEnvs:
     def each(self, function: Callable[[Worker], object]) -> list:
         """function(worker) for all workers at the same time, each in a thread of its own, so that
         none waits for another: while one acts, the other steps. Returns the results in order."""
-        with ThreadPoolExecutor(self.num_workers) as pool:
+        if self.num_workers == 1:
+            return [function(self.workers[0])]
+        pool = ThreadPoolExecutor(self.num_workers)
+        try:
             return list(pool.map(function, self.workers))
+        finally:
+            pool.shutdown(wait=False)  # an environment may hang: __exit__ ends its process
 
     def reset(self, seed: int) -> None:
         """Seed environment i with seed + i."""
