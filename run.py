@@ -134,8 +134,8 @@ def rollout(envs: ParallelEnvs, policy: Policy, horizon: int) -> tuple[dict, np.
         parts = envs.each(partial(episodes_of, policy=policy, horizon=horizon))
     parts, successes = zip(*parts, strict=True)
     episodes = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    for name, array in episodes.items():
-        if not np.isfinite(array).all():
+    for name in ("desired_goal", "obs", "achieved_goal"):
+        if not np.isfinite(episodes[name]).all():
             raise FloatingPointError(f"NaN or Inf in the {name} of an episode")
     return episodes, np.concatenate(successes)
 
@@ -146,6 +146,8 @@ def episodes_of(worker: Worker, policy: Policy, horizon: int) -> tuple[dict, np.
     goal = steps[0]["desired_goal"]
     for t in range(horizon):  # 6: T steps
         actions.append(np.float32(policy(t, worker.rows, steps[-1]["observation"], goal)))  # 7: a_t
+        if not np.isfinite(actions[-1]).all() and np.isfinite(steps[-1]["observation"]).all():
+            raise FloatingPointError("NaN or Inf in the actions, so in the networks")
         obs, success = worker.step(actions[-1])  # 8: s_{t+1}; Eq. (1) gives r_t when it is needed
         steps.append(obs)
     episodes = {

@@ -105,11 +105,24 @@ def smoothed(x: np.ndarray, weight: float) -> np.ndarray:
     return y
 
 
-def interval(x: np.ndarray, draws: int = 2000) -> tuple[np.ndarray, np.ndarray]:
-    """The 95 % interval of the mean over the first axis, seeds, by bootstrap. (S, ...) -> (...)."""
-    rng = np.random.default_rng(0)
-    means = x[rng.integers(len(x), size=(draws, len(x)))].mean(axis=1)
-    return tuple(np.quantile(means, [0.025, 0.975], axis=0))
+# Student's t, 0.975, by the number of seeds; for fewer no interval is given
+T_975 = {5: 2.776, 6: 2.571, 7: 2.447, 8: 2.365, 9: 2.306, 10: 2.262}
+
+
+def interval(x: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """The 95 % interval of the mean over the first axis, seeds, by Student's t: (S, ...) -> (...).
+    None for fewer than 5 seeds; for more than 10 that of 10, a little too wide."""
+    if len(x) < min(T_975):
+        return None
+    half = T_975.get(len(x), T_975[10]) * x.std(axis=0, ddof=1) / np.sqrt(len(x))
+    return x.mean(axis=0) - half, x.mean(axis=0) + half
+
+
+def said(x: np.ndarray) -> str:
+    """The mean over seeds with its interval, or with the seeds' own numbers where they are few."""
+    ends = interval(x)
+    its = "{:.3f}-{:.3f}".format(*ends) if ends else " ".join(f"{seed:.3f}" for seed in x)
+    return f"{x.mean():.3f} ({its})" if len(x) > 1 else f"{x.mean():.3f}"
 
 
 def draw_line(ax: Axes, seeds: list[np.ndarray], style: int, text: str, smooth: float) -> None:
@@ -118,8 +131,9 @@ def draw_line(ax: Axes, seeds: list[np.ndarray], style: int, text: str, smooth: 
     y = smoothed(np.stack([s[:shortest] for s in seeds]), smooth)
     epochs = np.arange(1, shortest + 1)
     ax.plot(epochs, y.mean(axis=0), color=COLOURS[style], linestyle=DASHES[style], label=text)
-    if len(seeds) > 1:
-        ax.fill_between(epochs, *interval(y), color=COLOURS[style], alpha=0.15, linewidth=0)
+    ends = interval(y)
+    if ends:
+        ax.fill_between(epochs, *ends, color=COLOURS[style], alpha=0.15, linewidth=0)
 
 
 def schedule(c: Config) -> str:
@@ -157,7 +171,8 @@ def curves(runs: list[Run], title: str, smooth: float, alone: bool) -> Figure:
     how = f"; smoothed, weight {smooth}" if smooth else ""
     fig.supylabel("test success rate", fontsize=9)
     fig.suptitle(
-        f"{title}\nmean and 95 % interval over seeds (how many: in brackets){how}", fontsize=9
+        f"{title}\nmean over seeds (how many: in brackets), with a 95 % interval from 5 on{how}",
+        fontsize=9,
     )
     return fig
 
@@ -187,7 +202,7 @@ def interquartile_mean(x: np.ndarray) -> float:
 def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
     """Two tables. For each environment and method: the first epoch with a success of 0.95 and the
     minutes an epoch took (medians over seeds), the mean success over the epochs that all runs of
-    the environment have, and over the last ones of each run, with 95 % intervals. For each method
+    the environment have, and over the last ones of each run, as `said`. For each method
     that shares more than one environment with VCP: the interquartile mean over all of the second
     for both, on the shared ones, each of the same weight, with a bootstrap that draws seeds within
     each. Runs that were stopped before their last epoch are left out."""
@@ -209,10 +224,7 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
             means[name][env] = np.array([curve[:epochs].mean() for curve in seeds])
             end = np.array([curve[-last:].mean() for curve in seeds])
             columns = [f"{len(seeds)}", f"{epochs}", "never" if np.isinf(first) else f"{first:g}"]
-            for x in (means[name][env], end):
-                columns.append(f"{x.mean():.3f}")
-                if len(seeds) > 1:
-                    columns[-1] += " ({:.3f}-{:.3f})".format(*interval(x))
+            columns += [said(means[name][env]), said(end)]
             columns.append(f"{np.median(minutes[env, name]):.2f}")
             lines.append(f"| {env} | {name} | {' | '.join(columns)} |")
 
@@ -222,6 +234,8 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
         def middle(scores):
             return interquartile_mean(np.stack([np.repeat(x, seeds // len(x)) for x in scores]))
 
+        if min(map(len, scores)) < min(T_975):
+            return f"{middle(scores):.3f}"
         rng = np.random.default_rng(0)
         drawn = [middle([rng.choice(x, len(x)) for x in scores]) for _ in range(draws)]
         low, high = np.quantile(drawn, [0.025, 0.975])

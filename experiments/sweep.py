@@ -47,7 +47,10 @@ def settings(text: str) -> dict:
 def seeds(text: str) -> list[int]:
     """ "0-2,7" -> [0, 1, 2, 7]."""
     ends = [[int(end) for end in part.split("-")] for part in text.split(",")]
-    return [seed for part in ends for seed in range(part[0], part[-1] + 1)]
+    seeds = [seed for part in ends for seed in range(part[0], part[-1] + 1)]
+    if not seeds:
+        raise argparse.ArgumentTypeError(f"{text} holds no seed")
+    return seeds
 
 
 def all_runs(
@@ -152,4 +155,7 @@ def main(argv: Iterable[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.exit("sweep.py: stopped; the same command goes on")

@@ -1,6 +1,8 @@
 """A run's parts, made from its settings: Algorithm 2, line 1."""
 
 import math
+import os
+import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -8,7 +10,7 @@ import gymnasium as gym
 
 from baselines import cher, dtgsh, herebp
 from baselines.her import HERReplay
-from ensemble import EnsembleDDPG
+from ensemble import HIDDEN, EnsembleDDPG
 from harness import records, settings
 from harness.errors import UsageError
 from harness.settings import Config
@@ -16,6 +18,13 @@ from harness.tasks import Task, examine, make_env
 from harness.workers import ParallelEnvs, whole_heads
 from her import EpisodeBuffer
 from vcp import HERBuffer
+
+
+def memory() -> int:
+    """The machine's memory in bytes; without a limit where it cannot be asked for."""
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return sys.maxsize
 
 
 @dataclass
@@ -41,10 +50,27 @@ class Parts:
         return ParallelEnvs(self.config.env, self.num_envs, workers, episode_length=length)
 
 
+def memory_needed(config: Config, task: Task) -> int:
+    """Bytes that networks, buffers and a mini-batch of a run take when they are full, roughly."""
+    row = 4 * (
+        2 * task.obs_dim + task.goal_dim + task.action_dim + 4
+    )  # of B_h, and of a mini-batch
+    of_a_head = 4 * HIDDEN * (HIDDEN + 2 + task.action_dim)
+    networks = 9 * config.heads * of_a_head  # two, with targets and moments, and a copy of one
+    scored = round(config.scored_per_drawn * config.batch_size * config.heads)
+    hidden = 8 * HIDDEN * max(config.batch_size, scored * config.heads)
+    b_o = 4 * config.buffer_size * (task.obs_dim + task.goal_dim + task.action_dim)
+    return networks + hidden + b_o + row * ((config.her_buffer_capacity or 0) + config.batch_size)
+
+
 def assemble(config: Config) -> Parts:
     """All parts of a run, untrained. config: complete. UsageError for an environment that cannot be
-    learned in."""
+    learned in, and for sizes that the machine's memory does not hold."""
     task = examine(config.env, config.episode_length)
+    needed, there = memory_needed(config, task), memory()
+    if needed > there:
+        sizes = "--heads, --batch-size, --buffer-size"
+        raise UsageError(f"{needed >> 30} GB are needed and {there >> 30} are there: lower {sizes}")
     if config.buffer_size < task.horizon:
         raise UsageError(f"--buffer-size must be {task.horizon} or more, to hold an episode")
     # One environment a head; fewer than 16 heads have several each, for the paper's amount of data.

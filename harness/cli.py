@@ -14,6 +14,7 @@ from harness import records, settings
 from harness.errors import EnvironmentFailed, UsageError
 from harness.settings import Config
 
+ANIMATIONS = (".gif", ".webp", ".png")
 STOPS = (FloatingPointError, OSError, EnvironmentFailed, KeyboardInterrupt)  # no fault of run.py's
 
 
@@ -104,4 +105,6 @@ def parse(argv: list[str] | None) -> tuple[dict, argparse.Namespace]:
         fail("--resume and --play do not go together")
     if command.gif and not command.play:
         fail("--gif goes with --play")
+    if command.gif and Path(command.gif).suffix.lower() not in ANIMATIONS:
+        fail(f"--gif {command.gif}: its ending must be one of {', '.join(ANIMATIONS)}")
     return given, command

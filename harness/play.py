@@ -50,12 +50,11 @@ def play(folder: Path, gif: str | None = None) -> np.ndarray:
             images = [frame.resize((240, 240)).quantize(64, octree) for frame in frames]
             images[0].save(gif, save_all=True, append_images=images[1:], duration=60, loop=0)
             print(f"{gif}: {SHOWN} episodes, {os.path.getsize(gif) // 1024} KB")
-    except (AttributeError, ImportError, gym.error.DependencyNotInstalled) as error:
-        # what MuJoCo's renderers raise without a display or a driver
-        hint = "without a display, set MUJOCO_GL=egl (a GPU's driver) or osmesa (libosmesa6)"
-        raise UsageError(f"cannot draw {parts.config.env} ({error}); {hint}") from error
     except OSError as error:
         raise UsageError(f"cannot write {gif}: {error.strerror or error}") from error
+    except Exception as error:  # MuJoCo's renderers raise many kinds without a display or a driver
+        hint = "without a display, set MUJOCO_GL=egl (a GPU's driver) or osmesa (libosmesa6)"
+        raise UsageError(f"cannot draw {parts.config.env} ({error}); {hint}") from error
     return rates
 
 

@@ -209,8 +209,11 @@ def read_rows(folder: Path) -> list[dict[str, float]]:
 
 
 def epochs_done(folder: Path) -> int:
-    """How many whole epochs progress.csv has; 0 if it is not there yet."""
-    return len(read_rows(folder)) if (folder / "progress.csv").exists() else 0
+    """How many whole epochs progress.csv has; 0 if it is not there yet, or not readable."""
+    try:
+        return len(read_rows(folder))
+    except (OSError, ValueError, TypeError):  # the checkpoint says what to go on with
+        return 0
 
 
 def save_checkpoint(folder: Path, state: dict) -> None:

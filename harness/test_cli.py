@@ -10,10 +10,12 @@ import time
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 import envs_point
 import run
+from ensemble import EnsembleDDPG
 from harness import records
 from harness.records import read_checkpoint
 from harness.testing import ARGUMENTS, SMALL, command, finish, main, start
@@ -87,11 +89,15 @@ class Hasty(envs_point.PointMass):
 gym.register("Hasty-v0", Hasty, max_episode_steps=10)
 
 
-def test_a_nan_stops_the_run_and_says_where(tmp_path):
+def test_a_nan_stops_the_run_and_says_where(tmp_path, monkeypatch):
     settings = {**SMALL, "env": "Broken-v0", "out": str(tmp_path / "run"), "epochs": 1}
     with pytest.raises(FloatingPointError, match="obs of an episode"):
         run.train(Config(**settings))
     assert threading.active_count() == 1
+    settings = {**SMALL, "out": str(tmp_path / "act"), "epochs": 1}
+    with monkeypatch.context() as patch, pytest.raises(FloatingPointError, match="in the networks"):
+        patch.setattr(EnsembleDDPG, "act", lambda self, *args: np.full((2, 8, 2), np.nan))
+        run.train(Config(**settings))
     settings = {**SMALL, "env": "BrokenReward-v0", "out": str(tmp_path / "reward"), "epochs": 1}
     with pytest.raises(FloatingPointError, match="in the rewards"):
         run.train(Config(**settings))
@@ -141,6 +147,38 @@ BAD = [
     ("--acting-head none", "--acting-head"),
     ("--device tpu", "--device"),
     ("--nonsense", "--nonsense"),
+    ("--learning-rate -1", "--learning-rate must be above 0"),
+    ("--learning-rate nan", "--learning-rate must be a finite number"),
+    ("--trunk-rate 0", "--trunk-rate must be above 0"),
+    ("--relabel-ratio 80", "--relabel-ratio must be 1 or less"),
+    ("--relabel-ratio -0.1", "--relabel-ratio must be 0 or more"),
+    ("--polyak 1.5", "--polyak must be 1 or less"),
+    ("--noise -1", "--noise must be 0 or more"),
+    ("--random-actions 2", "--random-actions must be 1 or less"),
+    ("--action-penalty -1", "--action-penalty must be 0 or more"),
+    ("--temperature -1", "--temperature must be 0 or more"),
+    ("--scored-per-drawn 0", "--scored-per-drawn must be above 0"),
+    ("--scored-per-drawn 0.00001", "--scored-per-drawn must be"),
+    ("--her-buffer-capacity 9", "are scored at once, and B_h holds 9"),
+    ("--her-buffer-capacity 0", "--her-buffer-capacity must be 1 or more"),
+    ("--buffer-size 49", "--buffer-size must be 50 or more"),
+    ("--episode-length 0", "--episode-length must be 1 or more"),
+    ("--seed 18446744073709551616", "--seed must be 4294967295 or less"),
+    ("--heads 10000000", "lower --heads"),
+    ("--batch-size 1000000000", "lower --heads, --batch-size"),
+    ("--buffer-size 100000000000", "lower --heads, --batch-size, --buffer-size"),
+    ("--batch 16", "--batch"),
+    ("--env a:b:c-v0", "cannot make the environment a:b:c-v0"),
+    ("--env ../x:Y", "cannot make the environment ../x:Y"),
+    ("--env :X", "cannot make the environment :X"),
+    ("--env broken_module:Own-v0", "SyntaxError"),
+    ("--resume=", "--resume needs a name"),
+    ("--play=", "--play needs a name"),
+    ("--play full --gif=", "--gif needs a name"),
+    ("--play full --gif a.mp3", "its ending must be one of .gif"),
+    ("--resume typed", "--epochs must be of type int"),
+    ("--resume list", "another version"),
+    (f"--out {300 * 'x'}", "cannot write"),
     ("--out full", "already holds a run"),
     ("--out full/config.json/below", "cannot write"),
     ("--resume nowhere", "does not hold a run"),
@@ -157,9 +195,16 @@ BAD = [
 def test_bad_input_gets_one_line_and_exit_code_2(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     older = json.dumps({"config": {"no_such_setting": 1}})
-    for name, text in (("full", json.dumps({"config": SMALL})), ("broken", "{"), ("older", older)):
+    for name, text in (
+        ("full", json.dumps({"config": SMALL})),
+        ("broken", "{"),
+        ("older", older),
+        ("typed", json.dumps({"config": {**SMALL, "epochs": "3"}})),
+        ("list", json.dumps({"config": [1]})),
+    ):
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").write_text(text)
+    (tmp_path / "broken_module.py").write_text("def (")
     before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}
     ours = [] if "--resume" in arguments or "--play" in arguments else ["--env", SMALL["env"]]
     with pytest.raises(SystemExit) as stop:
