@@ -49,7 +49,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     agent, original_buffer, her_buffer = its.agent, its.original_buffer, its.her_buffer
     heads, num_envs, horizon = config.heads, its.num_envs, its.task.horizon
     acting = heads if config.acting_head == "all" else 1  # Section 5.6
-    noise_shape = (horizon, num_envs, its.task.action_dim)
+    noise_shape, steps = (horizon, num_envs, its.task.action_dim), num_envs * horizon
     test_rounds = math.ceil(config.eval_episodes / num_envs)
 
     folder, began = Path(config.out), time.perf_counter()
@@ -62,9 +62,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     ):
         print(its.task.made)
         for epoch in range(len(rows) + 1, config.epochs + 1):  # 2: M epochs
-            seeds = np.random.SeedSequence([config.seed, epoch])
-            train_seed, test_seed = map(int, seeds.generate_state(2))
-            play_rng, her_rng, draw_rng = map(np.random.default_rng, seeds.spawn(3))
+            train_seed, test_seed, play_rng, her_rng, draw_rng = randomness(config.seed, epoch)
             relabelling = (her_rng, config.relabel_ratio, its.task.reward_fn)
             notes = records.Notes(epoch, config.epochs, config.cycles + test_rounds)
             envs.reset(train_seed)
@@ -75,13 +73,10 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                     random_actions = config.random_actions if cycle else 1
                     policy = greedy(agent, acting, num_envs)  # each head has its environments
                     policy = exploring(policy, play_rng, noise_shape, config.noise, random_actions)
-                    episodes, success = rollout(
-                        envs, policy, horizon
-                    )  # 4-8, 10, 11: an episode each
+                    episodes, success = rollout(envs, policy, horizon)  # 4-8, 10, 11
                     slots = original_buffer.add(episodes, play_rng)  # 9: into B_o
                     # + HER+: the normaliser sees what the networks will, relabelled goals too
-                    size = num_envs * horizon
-                    seen = relabel_future(episodes, size, play_rng, *relabelling[1:])
+                    seen = relabel_future(episodes, steps, play_rng, *relabelling[1:])
                     agent.normalizer.update(np.concatenate([seen["obs"], seen["goal"]], axis=1))
                     if her_buffer is None:  # + another method's replay
                         its.replay.new_episodes(slots)
@@ -114,11 +109,18 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                 with notes.timed("eval"):
                     tests.append(evaluate(envs, agent, heads, horizon))
             test = tuple(float(np.mean(part)) for part in zip(*tests, strict=True))
-            env_steps = num_envs * horizon * (epoch * config.cycles + 1)
+            env_steps = steps * (epoch * config.cycles + 1)
             rows.append(notes.row(env_steps, test, agent, its.replay, began))
             records.save(folder, asdict(config), rows, its.state())
             notes.write(rows[-1])
     return rows  # 18
+
+
+def randomness(seed: int, epoch: int) -> tuple:
+    """Two seeds, of the environments in training and in tests, and three generators, for episodes,
+    for Algorithm 1 and for what the heads draw."""
+    seeds = np.random.SeedSequence([seed, epoch])
+    return *map(int, seeds.generate_state(2)), *map(np.random.default_rng, seeds.spawn(3))
 
 
 # ------------------------------------------------------------------------------ lines 4-11
