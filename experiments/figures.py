@@ -310,8 +310,14 @@ def main() -> None:
         "--smooth", type=float, default=0.0, help="of the curves; the paper's: 0.9, or 0.6"
     )
     given = parser.parse_args()
-    for name in NAMES if given.name == "all" else [given.name]:
-        print(draw(name, smooth=given.smooth))
+    if given.name != "all":
+        print(draw(given.name, smooth=given.smooth))
+        return
+    for name in NAMES:
+        try:
+            print(draw(name, smooth=given.smooth))
+        except (SystemExit, ImportError) as missing:  # the others can be drawn
+            print(missing, file=sys.stderr)
 
 
 if __name__ == "__main__":

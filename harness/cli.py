@@ -70,6 +70,7 @@ def parse(argv: list[str] | None) -> tuple[dict, argparse.Namespace]:
     """The command line: the fields of Config that were given, and resume, play and gif."""
     parser = argparse.ArgumentParser(
         prog="run.py",
+        usage="python run.py [OPTION ...]",
         description="Train Value Consistency Prioritization, or play what it learned",
         allow_abbrev=False,
         add_help=False,

@@ -19,6 +19,7 @@ from harness.records import TIMING_COLUMNS, read_checkpoint, read_rows
 from run import train
 
 HERE = Path(__file__).parent.parent
+torch.set_num_threads(1)  # two wait for each other, for most of the time where cores are shared
 
 
 SMALL_TRAINING = {"epochs": 1, "cycles": 2, "updates": 2, "batch_size": 32, "eval_episodes": 16}
