@@ -82,8 +82,7 @@ class Normalizer:
 
     def __init__(self, dim: int, device="cpu"):
         self.count = 0
-        self.sum = np.zeros(dim)  # float64: the sums run over millions of rows
-        self.sum_of_squares = np.zeros(dim)
+        self.sum, self.sum_of_squares = np.zeros((2, dim))  # float64: over millions of rows
         self.mean = torch.zeros(dim, device=device)
         self.std = torch.ones(dim, device=device)
 
@@ -201,9 +200,8 @@ class EnsembleDDPG:
         """Algorithm 2, line 16: one DDPG step of head k, Eqs. (2) and (3), conditioned on goals.
 
         batch: obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,) and weight (B,).
-        It moves head k and both trunks, no other head. Both gradients are taken before either
-        step. There is no terminal state: episodes have a fixed length. Returns (2,), the losses of
-        critic and actor.
+        It moves head k and both trunks, no other head; both gradients are taken before either step.
+        No state is terminal: episodes have a fixed length. Returns critic's and actor's loss, (2,).
         """
         state = self._state(batch["obs"], batch["goal"])  # (B, O+G)
         next_state = self._state(batch["next_obs"], batch["goal"])
@@ -239,8 +237,7 @@ class EnsembleDDPG:
         the trunk is averaged K times, and K steps of 0.95 are one step of 0.95^K (NOTES.md, "the
         trunk's targets").
         """
-        trunk_step = 1 - self.polyak**self.heads
-        self._move_targets(trunk_step, head_step=1 - self.polyak)
+        self._move_targets(1 - self.polyak**self.heads, head_step=1 - self.polyak)
 
     @torch.no_grad()
     def _move_targets(self, trunk_step: float, head_step: float) -> None:

@@ -18,9 +18,7 @@ def goal_space(obs_dim: int, goal_dim: int, bound: float = np.inf) -> gym.spaces
     """The observation space of a goal environment, float64, all entries within ±bound."""
     goal = Box(-bound, bound, (goal_dim,), np.float64)
     observation = Box(-bound, bound, (obs_dim,), np.float64)
-    return gym.spaces.Dict(
-        {"observation": observation, "achieved_goal": goal, "desired_goal": goal}
-    )
+    return gym.spaces.Dict(observation=observation, achieved_goal=goal, desired_goal=goal)
 
 
 def sparse_reward(achieved: np.ndarray, desired: np.ndarray, threshold: float) -> np.ndarray:

@@ -51,7 +51,6 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     acting = heads if config.acting_head == "all" else 1  # Section 5.6
     noise_shape, steps = (horizon, num_envs, its.task.action_dim), num_envs * horizon
     test_rounds = math.ceil(config.eval_episodes / num_envs)
-
     folder, began = Path(config.out), time.perf_counter()
     rows = records.restore(folder, asdict(config), its.state()) if resume else []
     began -= rows[-1]["wall_seconds"] if rows else 0
