@@ -57,8 +57,8 @@ def memory_needed(config: Config, task: Task) -> int:
     )  # of B_h, and of a mini-batch
     of_a_head = 4 * HIDDEN * (HIDDEN + 2 + task.action_dim)
     networks = 9 * config.heads * of_a_head  # two, with targets and moments, and a copy of one
-    scored = round(config.scored_per_drawn * config.batch_size * config.heads)
-    hidden = 8 * HIDDEN * max(config.batch_size, scored * config.heads)
+    scored = settings.scored_a_sweep(config) * config.heads
+    hidden = 8 * HIDDEN * max(config.batch_size, scored)
     b_o = 4 * config.buffer_size * (task.obs_dim + task.goal_dim + task.action_dim)
     return networks + hidden + b_o + row * ((config.her_buffer_capacity or 0) + config.batch_size)
 
