@@ -116,8 +116,8 @@ class PointMass(gym.Env):
         return self._observe(), float(success) - 1, False, False, {"is_success": success}
 
     def render(self) -> np.ndarray | None:
-        """A picture of the room, (240, 240, 3) uint8; in mode "human", a window instead."""
-        picture = self._draw(240)
+        """A picture of the room, (360, 360, 3) uint8; in mode "human", a window instead."""
+        picture = self._draw(360)
         if self.render_mode != "human":
             return picture
         import matplotlib.pyplot as plt

@@ -590,12 +590,12 @@ def test_point_mass_renders_and_is_seeded(name):
     env = gym.make(name, render_mode="rgb_array")
     first, _ = env.reset(seed=3)
     picture = env.render()
-    assert picture.shape == (240, 240, 3) and picture.dtype == np.uint8
+    assert picture.shape == (360, 360, 3) and picture.dtype == np.uint8
     colours = {tuple(c) for c in picture.reshape(-1, 3).tolist()}
     assert len(colours) == 4  # floor, walls, circle, goal
     # the circle is drawn where it is: rows go down, y goes up
     rows, columns = np.nonzero((picture == (0, 114, 178)).all(axis=-1))
-    place = np.array([columns.mean() - 119.5, 119.5 - rows.mean()]) / 240 * 2 * 0.66
+    place = np.array([columns.mean() - 179.5, 179.5 - rows.mean()]) / 360 * 2 * 0.66
     np.testing.assert_allclose(place, first["achieved_goal"], atol=0.02)
     again, _ = env.reset(seed=3)
     other, _ = env.reset()

@@ -30,7 +30,7 @@ def main(train: Callable, argv: list[str] | None = None) -> None:
         if command.play is not None:
             from harness.play import play
 
-            play(Path(command.play), command.gif)
+            play(Path(command.play), command.gif, command.policy)
             return
         config = Config(**given)
         if command.resume is not None:
@@ -67,7 +67,7 @@ def fail(message: str) -> NoReturn:
 
 
 def parse(argv: list[str] | None) -> tuple[dict, argparse.Namespace]:
-    """The command line: the fields of Config that were given, and resume, play and gif."""
+    """The command line: the fields of Config that were given, and resume, play, gif and policy."""
     parser = argparse.ArgumentParser(
         prog="run.py",
         usage="python run.py [OPTION ...]",
@@ -85,8 +85,9 @@ def parse(argv: list[str] | None) -> tuple[dict, argparse.Namespace]:
     run = groups[settings.RUN]
     run.add_argument("-h", "--help", action="help", help="show this and stop")
     run.add_argument("--resume", metavar="DIR", help="go on with the run in DIR")
-    run.add_argument("--play", metavar="DIR", help="play episodes with what the run in DIR learned")
+    run.add_argument("--play", metavar="DIR", help="play what the run in DIR, or a policy, learned")
     run.add_argument("--gif", metavar="FILE", help="with --play: write an animation, no window")
+    run.add_argument("--policy", metavar="FILE.npz", help="with --play: write the best head's")
     for f in fields(Config):
         how = {"default": argparse.SUPPRESS, "help": f.metadata["help"].replace("%", "%%")}
         if settings.kind(f) is bool:
@@ -98,14 +99,18 @@ def parse(argv: list[str] | None) -> tuple[dict, argparse.Namespace]:
     with contextlib.suppress(AttributeError):  # 𝒯 on a terminal that is not UTF-8
         sys.stdout.reconfigure(errors="replace")
     given = vars(parser.parse_args(argv))
-    command = argparse.Namespace(**{name: given.pop(name) for name in ("resume", "play", "gif")})
+    names = ("resume", "play", "gif", "policy")
+    command = argparse.Namespace(**{name: given.pop(name) for name in names})
     for name, value in vars(command).items():
         if value == "":
             fail(f"--{name} needs a name, and was given none")
     if command.resume and command.play:
         fail("--resume and --play do not go together")
-    if command.gif and not command.play:
-        fail("--gif goes with --play")
+    for name in ("gif", "policy"):
+        if getattr(command, name) and not command.play:
+            fail(f"--{name} goes with --play")
     if command.gif and Path(command.gif).suffix.lower() not in ANIMATIONS:
         fail(f"--gif {command.gif}: its ending must be one of {', '.join(ANIMATIONS)}")
+    if command.policy and Path(command.policy).suffix != ".npz":
+        fail(f"--policy {command.policy}: its ending must be .npz")
     return given, command

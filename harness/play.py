@@ -1,31 +1,42 @@
-"""Look at what a run learned: python run.py --play DIR [--gif FILE]"""
+"""Look at what was learned: python run.py --play DIR [--gif FILE] [--policy FILE]
 
+A policy is one head's actor and the normaliser, an .npz of half a megabyte: NumPy arrays, which
+cannot run code. `--play FILE.npz` plays it.
+"""
+
+import json
 import os
 import sys
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import torch
 from PIL import Image
 from tqdm.auto import tqdm
 
 from ensemble import EnsembleDDPG
-from harness.assemble import load, restored
+from harness.assemble import restored
 from harness.errors import UsageError
-from harness.tasks import succeeded
+from harness.records import write_whole
+from harness.tasks import make_env, succeeded
 
 EPISODES = 10  # of each head
 SHOWN = 3  # of the best head
+HELD = 6  # steps that a shown episode goes on for at its goal
 SEED = 1_000_000
+PIXELS = 360  # of an animation, each side
+ABOUT = ("env", "episode_length", "method", "seed")  # what a policy says of its run
 
 
-def play(folder: Path, gif: str | None = None) -> np.ndarray:
-    """Play EPISODES test episodes with each head of the run in `folder`, print the success rates,
-    and show SHOWN episodes of the best head: in a window where there is a display, or as the
-    animation `gif`. Returns the success rate of each head, (K,). UsageError if nothing was learned
-    yet, or for pictures that cannot be drawn."""
-    parts, rows = restored(folder)
-    agent, env = load(folder)
+def play(source: Path, gif: str | None = None, policy: str | None = None) -> np.ndarray:
+    """Play EPISODES test episodes with each head of a run's folder or with a policy's file, print
+    the success rates, write the best head to the file `policy`, and show SHOWN episodes of it: in a
+    window where there is a display, or as the animation `gif`. Returns the success rate of each
+    head, (K,). UsageError if nothing was learned yet, for a file that is no policy, and for
+    pictures that cannot be drawn."""
+    agent, about = read_policy(source) if source.is_file() else of_run(source)
+    env = make_env(about["env"], about["episode_length"])
     seeds = range(SEED, SEED + EPISODES)
     rates = np.zeros(agent.heads)
     for head in tqdm(range(agent.heads), desc="heads", leave=False, disable=None):
@@ -33,42 +44,113 @@ def play(folder: Path, gif: str | None = None) -> np.ndarray:
     env.close()
     best = int(rates.argmax())
     print(
-        f"{parts.config.env} after epoch {rows[-1]['epoch']}: success {rates.mean():.3f} over"
-        f" {agent.heads * EPISODES} episodes, the best head ({best}) {rates[best]:.2f}"
+        f"{about['env']} after epoch {about['epoch']}: success {rates.mean():.3f} over"
+        f" {agent.heads * EPISODES} episodes"
     )
+    if agent.heads > 1:
+        print(f"by head: {' '.join(f'{rate:.1f}' for rate in rates)}; the best is {best}")
+    if policy:
+        write_policy(Path(policy), agent, best, about)
+        print(f"{policy}: head {best}, {os.path.getsize(policy) // 1024} KB")
     window = gif is None and (sys.platform in ("darwin", "win32") or "DISPLAY" in os.environ)
-    if not window and not gif:
-        print(f"no display; for an animation: python run.py --play {folder} --gif FILE.gif")
-        return rates
+    if gif or window:
+        show(about, agent, best, seeds[:SHOWN], gif)
+    elif not policy:
+        print(f"no display; for an animation: python run.py --play {source} --gif FILE.gif")
+    return rates
+
+
+def show(about: dict, agent: EnsembleDDPG, head: int, seeds: range, gif: str | None) -> None:
+    """Episodes of a head as the animation `gif` or, without a name, in a window. UsageError where
+    neither can be."""
     try:
-        _, env = load(folder, render_mode="human" if window else "rgb_array")
-        shown = [episode(env, agent, best, seed, pictures=True)[1] for seed in seeds[:SHOWN]]
+        mode = "rgb_array" if gif else "human"
+        env = make_env(about["env"], about["episode_length"], render_mode=mode)
+        shown = [episode(env, agent, head, seed)[1] for seed in seeds]
         env.close()
         if gif:
             octree = Image.Quantize.FASTOCTREE  # keeps the colour of something as small as a goal
             frames = [Image.fromarray(frame) for frames in shown for frame in frames]
-            images = [frame.resize((240, 240)).quantize(64, octree) for frame in frames]
+            images = [frame.resize((PIXELS, PIXELS)).quantize(64, octree) for frame in frames]
             images[0].save(gif, save_all=True, append_images=images[1:], duration=60, loop=0)
-            print(f"{gif}: {SHOWN} episodes, {os.path.getsize(gif) // 1024} KB")
+            print(f"{gif}: {len(seeds)} episodes, {os.path.getsize(gif) // 1024} KB")
     except OSError as error:
         raise UsageError(f"cannot write {gif}: {error.strerror or error}") from error
     except Exception as error:  # MuJoCo's renderers raise many kinds without a display or a driver
         hint = "without a display, set MUJOCO_GL=egl (a GPU's driver) or osmesa (libosmesa6)"
-        raise UsageError(f"cannot draw {parts.config.env} ({error}); {hint}") from error
-    return rates
+        raise UsageError(f"cannot draw {about['env']} ({error}); {hint}") from error
 
 
 def episode(
-    env: gym.Env, agent: EnsembleDDPG, head: int, seed: int, pictures: bool = False
+    env: gym.Env, agent: EnsembleDDPG, head: int, seed: int
 ) -> tuple[bool, list[np.ndarray]]:
     """An episode of one head, without noise: its success at the last step and, where the
-    environment draws any, its pictures, (height, width, 3) uint8, two steps apart."""
+    environment draws any, its pictures, (height, width, 3) uint8, two steps apart. One that is
+    looked at ends when it has been at its goal for HELD steps."""
     obs, _ = env.reset(seed=seed)
-    frames = []
+    frames, held = [], 0
     for t in range(env.spec.max_episode_steps):
-        if pictures and env.render_mode == "rgb_array" and t % 2 == 0:
+        if env.render_mode == "rgb_array" and t % 2 == 0:
             frames.append(env.render())
+        if env.render_mode == "human" and t == 0:
+            hide_menu(env)
         rows = obs["observation"][None, None], obs["desired_goal"][None, None]
         action = agent.act(*rows, slice(head, head + 1))[0, 0]
         obs, reward, _, _, info = env.step(action)
-    return succeeded(reward, info), frames
+        held = held + 1 if succeeded(reward, info) else 0
+        if env.render_mode and held == HELD:
+            break
+    return held > 0, frames
+
+
+def hide_menu(env: gym.Env) -> None:
+    """Take MuJoCo's list of keys off its window, as the key H does."""
+    viewer = getattr(getattr(env.unwrapped, "mujoco_renderer", None), "viewer", None)
+    if viewer is not None:
+        viewer._hide_menu = True
+
+
+# ------------------------------------------------------------------------------ policies
+
+
+def of_run(folder: Path) -> tuple[EnsembleDDPG, dict]:
+    """The agent of the run in `folder`, and what a policy says of it. UsageError without one."""
+    parts, rows = restored(folder)
+    about = {name: getattr(parts.config, name) for name in ABOUT}
+    return parts.agent, {**about, "epoch": rows[-1]["epoch"]}
+
+
+def write_policy(path: Path, agent: EnsembleDDPG, head: int, about: dict) -> None:
+    """What head `head` needs to act: its actor's eight tensors, the normaliser's mean and standard
+    deviation (float32), and `about` as JSON. UsageError if it cannot be written."""
+    tensors = [*agent.actor.trunk, *agent.actor.own[head]]
+    arrays = {f"p{i}": p.detach().cpu().numpy() for i, p in enumerate(tensors)}
+    its = {name: getattr(agent.normalizer, name).cpu().numpy() for name in ("mean", "std")}
+    text = np.array(json.dumps(about))
+    try:
+        write_whole(path, lambda file: np.savez_compressed(file, about=text, **arrays, **its))
+    except OSError as error:
+        raise UsageError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+@torch.no_grad()
+def read_policy(path: Path) -> tuple[EnsembleDDPG, dict]:
+    """An agent of one head that acts as the policy in `path` does, with critics that have learned
+    nothing, and what the file says of its run. UsageError if the file is no whole policy."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        about = json.loads(str(arrays.pop("about")))
+        env = make_env(about["env"], about["episode_length"])
+        sizes = [env.observation_space[name].shape[0] for name in ("observation", "desired_goal")]
+        agent = EnsembleDDPG(*sizes, *env.action_space.shape, gamma=0.98, heads=1)
+        env.close()
+        its = {f"p{i}": p for i, p in enumerate(agent.actor.parameters())}
+        its |= {name: getattr(agent.normalizer, name) for name in ("mean", "std")}
+        for name, p in its.items():
+            p.copy_(torch.from_numpy(arrays[name]).reshape(p.shape))
+    except UsageError:
+        raise
+    except Exception as error:  # whatever a damaged file leads to
+        raise UsageError(f"{path} holds no policy ({type(error).__name__}: {error})") from error
+    return agent, about

@@ -176,6 +176,9 @@ BAD = [
     ("--play=", "--play needs a name"),
     ("--play full --gif=", "--gif needs a name"),
     ("--play full --gif a.mp3", "its ending must be one of .gif"),
+    ("--play full --policy a.pt", "its ending must be .npz"),
+    ("--policy a.npz", "--policy goes with --play"),
+    ("--play full/config.json", "holds no policy"),
     ("--resume typed", "--epochs must be of type int"),
     ("--resume list", "another version"),
     (f"--out {300 * 'x'}", "cannot write"),
@@ -227,6 +230,7 @@ def test_help_names_every_option_and_default(capsys):
         "--resume",
         "--play",
         "--gif",
+        "--policy",
         "--tensorboard",
     ):
         assert name in text

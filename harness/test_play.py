@@ -1,12 +1,18 @@
-"""Tests of playing a run."""
+"""Tests of playing a run, and of policies."""
 
+import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from PIL import Image
 
+from harness import play as module
 from harness import records
-from harness.play import play
+from harness.errors import UsageError
+from harness.play import episode, hide_menu, play, read_policy
+from harness.tasks import make_env
 
 
 def test_playing_a_run(whole, tmp_path, capsys):
@@ -17,10 +23,78 @@ def test_playing_a_run(whole, tmp_path, capsys):
     out = capsys.readouterr().out
     assert rates.shape == (2,) and np.all((rates >= 0) & (rates <= 1))
     assert f"success {rates.mean():.3f} over 20 episodes" in out and "after epoch 4" in out
+    assert f"by head: {rates[0]:.1f} {rates[1]:.1f}; the best is {rates.argmax()}" in out
     with Image.open(picture) as gif:
-        assert gif.size == (240, 240) and gif.n_frames > 20
+        assert gif.size == (360, 360) and gif.n_frames > 20
         frames = []
         for i in range(gif.n_frames):
             gif.seek(i)
             frames.append(np.asarray(gif.convert("RGB")).astype(int))
     assert np.abs(np.diff(frames, axis=0)).max() > 50  # something moves
+
+
+def test_a_policy_acts_as_the_best_head_and_plays_without_the_run(
+    whole, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    file = tmp_path / "policy.npz"
+    rates = play(whole, policy=str(file))
+    assert f"head {rates.argmax()}" in capsys.readouterr().out
+    assert file.stat().st_size < 1_000_000
+    agent, _ = module.of_run(whole)
+    its, about = read_policy(file)
+    assert about == {
+        "env": "PointMassEmptyEnv-v1",
+        "episode_length": None,
+        "method": "vcp",
+        "seed": 0,
+        "epoch": 4,
+    }
+    rows = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 1, 20, 2))
+    head = int(rates.argmax())
+    assert np.array_equal(its.act(*rows), agent.act(*rows, slice(head, head + 1)))
+    assert np.array_equal(play(file), rates[[head]])
+    out = capsys.readouterr().out
+    assert "over 10 episodes" in out and f"--play {file} --gif" in out and "by head" not in out
+
+
+def test_a_damaged_policy_or_one_of_another_task_is_refused(whole, tmp_path):
+    file = tmp_path / "policy.npz"
+    module.write_policy(file, *module.of_run(whole)[:1], 0, {"env": "x", "episode_length": None})
+    with pytest.raises(UsageError, match="cannot make the environment x"):
+        read_policy(file)
+    about = {"env": "FetchReach-v1", "episode_length": None}
+    module.write_policy(file, *module.of_run(whole)[:1], 0, about)
+    with pytest.raises(UsageError, match="holds no policy"):  # of other sizes
+        read_policy(file)
+    whole_file = file.read_bytes()
+    for place in np.random.default_rng(0).integers(len(whole_file), size=20):
+        broken = bytearray(whole_file)
+        broken[place] ^= 1 << 3
+        file.write_bytes(broken)
+        with pytest.raises(UsageError):
+            read_policy(file)
+    np.savez(file, about=np.array(json.dumps(about)), p0=np.array([print], dtype=object))
+    with pytest.raises(UsageError, match="Object arrays cannot be loaded"):  # they would run code
+        read_policy(file)
+
+
+def test_what_is_looked_at_ends_at_the_goal_and_what_is_counted_does_not():
+    env = make_env("PointMassEmptyEnv-v1")
+    shown = make_env("PointMassEmptyEnv-v1", render_mode="rgb_array")
+    towards = SimpleNamespace(act=lambda obs, goal, heads: np.clip(20 * (goal - obs), -1, 1))
+    away = SimpleNamespace(act=lambda obs, goal, heads: np.clip(20 * (obs - goal), -1, 1))
+    assert episode(env, towards, 0, seed=0) == (True, [])
+    success, frames = episode(shown, towards, 0, seed=0)
+    assert success and 3 <= len(frames) < 20
+    success, frames = episode(shown, away, 0, seed=0)
+    assert not success and len(frames) == 25
+
+
+def test_mujocos_window_comes_without_its_menu():
+    viewer = SimpleNamespace(_hide_menu=False)
+    hide_menu(
+        SimpleNamespace(unwrapped=SimpleNamespace(mujoco_renderer=SimpleNamespace(viewer=viewer)))
+    )
+    assert viewer._hide_menu
+    hide_menu(make_env("PointMassEmptyEnv-v1"))

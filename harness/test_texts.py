@@ -57,6 +57,6 @@ def test_links_lead_somewhere_and_options_exist(file):
     for link in re.findall(r"\]\(([^)#]+)", text):
         assert link.startswith("http") or (file.parent / link).exists(), link
     known = {settings.flag(f.name) for f in settings.fields(settings.Config)}
-    known |= {"--resume", "--play", "--gif", "--help"}
+    known |= {"--resume", "--play", "--gif", "--policy", "--help"}
     for command in re.findall(r"run\.py ([^`\n]*)", text):
         assert set(re.findall(r"--[a-z-]+", command)) <= known, command
