@@ -16,19 +16,21 @@ from PIL import Image
 from tqdm.auto import tqdm
 
 from ensemble import EnsembleDDPG
+from harness import numerics
 from harness.assemble import restored
 from harness.errors import UsageError
 from harness.records import write_whole
 from harness.tasks import make_env, succeeded
 
 EPISODES = 10  # of each head
-SHOWN = 3  # of the best head
-HELD = 6  # steps that a shown episode goes on for at its goal
+SHOWN = 5  # of the best head
+HELD = 10  # steps that a shown episode goes on for at its goal
 SEED = 1_000_000
 PIXELS = 360  # of an animation, each side
 ABOUT = ("env", "episode_length", "method", "seed")  # what a policy says of its run
 
 
+@numerics.one_thread()
 def play(source: Path, gif: str | None = None, policy: str | None = None) -> np.ndarray:
     """Play EPISODES test episodes with each head of a run's folder or with a policy's file, print
     the success rates, write the best head to the file `policy`, and show SHOWN episodes of it: in a
@@ -85,12 +87,12 @@ def episode(
     env: gym.Env, agent: EnsembleDDPG, head: int, seed: int
 ) -> tuple[bool, list[np.ndarray]]:
     """An episode of one head, without noise: its success at the last step and, where the
-    environment draws any, its pictures, (height, width, 3) uint8, two steps apart. One that is
-    looked at ends when it has been at its goal for HELD steps."""
+    environment draws any, a picture of each step, (height, width, 3) uint8. One that is looked at
+    ends when it has been at its goal for HELD steps."""
     obs, _ = env.reset(seed=seed)
     frames, held = [], 0
     for t in range(env.spec.max_episode_steps):
-        if env.render_mode == "rgb_array" and t % 2 == 0:
+        if env.render_mode == "rgb_array":
             frames.append(env.render())
         if env.render_mode == "human" and t == 0:
             hide_menu(env)

@@ -86,9 +86,9 @@ def test_what_is_looked_at_ends_at_the_goal_and_what_is_counted_does_not():
     away = SimpleNamespace(act=lambda obs, goal, heads: np.clip(20 * (obs - goal), -1, 1))
     assert episode(env, towards, 0, seed=0) == (True, [])
     success, frames = episode(shown, towards, 0, seed=0)
-    assert success and 3 <= len(frames) < 20
+    assert success and 10 <= len(frames) < 40
     success, frames = episode(shown, away, 0, seed=0)
-    assert not success and len(frames) == 25
+    assert not success and len(frames) == 50
 
 
 def test_mujocos_window_comes_without_its_menu():
