@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 import run
 from experiments.inspect_run import effective_share
@@ -134,27 +133,28 @@ def distance_correlation(data: dict[str, np.ndarray]) -> list[float]:
 
 def draw_figure_3(data: dict[str, np.ndarray]) -> Figure:
     """Figure 3: trajectories, coloured by the variance of (ŝ, its action, each achieved goal)."""
-    n = len(data["xy"])
-    fig = Figure(figsize=(2.6 * n, 3.2), layout="constrained")
-    panels = fig.subplots(1, n)
-    correlations = distance_correlation(data)
-    for ax, xy, t, variance, r in zip(
-        panels, data["xy"], data["t"], data["variance"], correlations, strict=True
+    fig = Figure(figsize=(8.3, 5.6), layout="constrained")
+    panels = fig.subplots(2, 3).flat
+    colour = np.log10(data["variance"])
+    limits = {"vmin": colour.min(), "vmax": colour.max(), "cmap": "viridis"}
+    for ax, xy, t, its, r in zip(
+        panels, data["xy"], data["t"], colour, distance_correlation(data), strict=False
     ):
         ax.plot(*xy.T, color="0.8", linewidth=1, zorder=0)
-        points = ax.scatter(*xy.T, c=np.log10(variance), cmap="viridis", s=14)
+        points = ax.scatter(*xy.T, c=its, s=14, **limits)
         ax.plot(*xy[0], "o", color=RED, markersize=7, label="start")
-        ax.plot(*xy[-1], "s", color=GREEN, markersize=7, label="end")
+        ax.plot(*xy[-1], "s", color=BLUE, markersize=7, label="end")
         ax.plot(*xy[t], "k^", markersize=9, label="ŝ")
-        ax.set_title(f"rank correlation with\nthe distance: {r:+.2f}", fontsize=8)
+        ax.set_title(f"rank correlation {r:+.2f}", fontsize=10)
         ax.set(aspect="equal", xlim=(-0.62, 0.62), ylim=(-0.62, 0.62), xticks=[], yticks=[])
-        bar = fig.colorbar(points, ax=ax, shrink=0.7, location="bottom", ticks=MaxNLocator(4))
-        bar.ax.tick_params(labelsize=6)
-    panels[0].legend(fontsize=7)
+    for ax in list(fig.axes)[len(data["xy"]) :]:
+        ax.axis("off")
+    fig.legend(*fig.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    fig.colorbar(points, ax=fig.axes, shrink=0.8, label="log₁₀ of the variance")
     fig.suptitle(
-        "Figure 3: log₁₀ of the variance of ŝ with each achieved goal of its trajectory\n"
-        "PointMassEmptyEnv-v1, 5 updates of batch 64 a cycle, epoch 10, one seed",
-        fontsize=9,
+        "Figure 3: variance of ŝ with each achieved goal of its trajectory and rank correlation\n"
+        "with the distance; PointMassEmptyEnv-v1, 5 updates of batch 64 a cycle, one seed",
+        fontsize=10,
     )
     return fig
 
@@ -165,7 +165,7 @@ def draw_figure_5(data: dict[str, dict[str, np.ndarray]]) -> Figure:
     from scipy.stats import gaussian_kde  # of requirements-experiments.txt
     from sklearn.manifold import TSNE
 
-    fig = Figure(figsize=(12.8, 3.3 * len(STAGES)), layout="constrained")
+    fig = Figure(figsize=(8.3, 2.4 * len(STAGES) + 0.8), layout="constrained")
     panels = fig.subplots(len(STAGES), 4)
     for line, epoch in zip(panels, STAGES, strict=True):
         kinds = [f"{kind}_{epoch}" for kind in ("original", "her", "drawn")]
@@ -179,23 +179,21 @@ def draw_figure_5(data: dict[str, dict[str, np.ndarray]]) -> Figure:
             points.scatter(*original.T, s=2, color=BLUE, label="B_o")
             points.scatter(*her.T, s=2, color=GREEN, label="B_h")
             points.scatter(*drawn.T, s=2, color=RED, label="drawn")
-            points.set_title(f"epoch {epoch}, {what}", fontsize=9)
+            points.set_title(f"epoch {epoch},\n{what}", fontsize=9)
             x, y = np.meshgrid(
                 *(np.linspace(*np.quantile(mapped[:, k], [0, 1]), 60) for k in (0, 1))
             )
             shade = gaussian_kde(drawn.T)(np.stack([x.ravel(), y.ravel()])).reshape(x.shape)
             density.pcolormesh(x, y, shade, cmap="viridis")
-            density.set_title(
-                f"density of what is drawn\n(effective sample size {effective:.1%} of B_h)",
-                fontsize=8,
-            )
+            density.set_title(f"drawn: as good as\n{effective:.2%} of B_h", fontsize=9)
             for ax in (points, density):
                 ax.set(xticks=[], yticks=[])
-    panels[0, 0].legend(fontsize=7, markerscale=4)
+    handles = panels[0, 0].get_legend_handles_labels()
+    fig.legend(*handles, loc="outside lower center", ncols=3, markerscale=5)
     fig.suptitle(
-        "Figure 5: data reuse on PointMassEmptyEnv-v1, half originals, B_o of 10,000, one seed;"
-        " 5 updates of batch 64 a cycle",
-        fontsize=9,
+        "Figure 5: what is drawn, and its density (effective sample size); PointMassEmptyEnv-v1,\n"
+        "half originals, B_o of 10,000, 5 updates of batch 64 a cycle, one seed",
+        fontsize=10,
     )
     return fig
 
@@ -203,7 +201,7 @@ def draw_figure_5(data: dict[str, dict[str, np.ndarray]]) -> Figure:
 def draw_figure_8(data: dict[int, dict[str, np.ndarray]]) -> Figure:
     """Figure 8: histograms of the variance in B_h for ensembles of K heads, and how often the
     priority draws an original transition (Section 5.8). data: arrays by K."""
-    fig = Figure(figsize=(5.2, 1.5 * len(data) + 0.6), layout="constrained")
+    fig = Figure(figsize=(6.4, 1.5 * len(data) + 1), layout="constrained")
     panels = fig.subplots(len(data), 1, sharex=True, squeeze=False)[:, 0]
     positive = np.concatenate([d["variance"] for d in data.values()])
     low, high = np.quantile(positive[positive > 0], [0.001, 1])
@@ -217,13 +215,14 @@ def draw_figure_8(data: dict[int, dict[str, np.ndarray]]) -> Figure:
         original = ~d["hindsight"]
         share, drawn = original.mean(), d["probability"][original].sum()
         ax.set(xscale="log", ylabel=f"K = {k}")
-        ax.set_title(f"originals: {share:.1%} of B_h, {drawn:.1%} of the draws", fontsize=7)
-    panels[0].legend(fontsize=7)
+        ax.set_title(f"originals: {share:.1%} of B_h, {drawn:.1%} of the draws", fontsize=9)
+    handles = panels[0].get_legend_handles_labels()
+    fig.legend(*handles, loc="outside lower center", ncols=2)
     panels[-1].set_xlabel("variance of the K Q-values in B_h (dashed: medians)")
     fig.suptitle(
         "Figure 8: PointMassEmptyEnv-v1, half originals,\n"
         "5 updates of batch 64 a cycle, epoch 10, one seed",
-        fontsize=9,
+        fontsize=10,
     )
     return fig
 

@@ -1,7 +1,7 @@
-"""The paper's figures from results/ alone: python -m experiments.figures NAME [--smooth WEIGHT]
+"""The paper's figures from results/ alone: python -m experiments.figures NAME [--runs DIR]
 
-Reads config.json and progress.csv of every run below results/ and writes results/NAME.png. What a
-run is follows from its settings, whatever its folder is called.
+Reads config.json and progress.csv of every run below results/, or below DIR, and writes NAME.png
+there. What a run is follows from its settings, whatever its folder is called.
 """
 
 import argparse
@@ -130,7 +130,8 @@ def draw_line(ax: Axes, seeds: list[np.ndarray], style: int, text: str, smooth: 
     shortest = min(map(len, seeds))
     y = smoothed(np.stack([s[:shortest] for s in seeds]), smooth)
     epochs = np.arange(1, shortest + 1)
-    ax.plot(epochs, y.mean(axis=0), color=COLOURS[style], linestyle=DASHES[style], label=text)
+    how = {"color": COLOURS[style], "linestyle": DASHES[style], "label": text}
+    ax.plot(epochs, y.mean(axis=0), **how, marker="o" if shortest == 1 else "")  # a line of one
     ends = interval(y)
     if ends:
         ax.fill_between(epochs, *ends, color=COLOURS[style], alpha=0.15, linewidth=0)
@@ -143,9 +144,9 @@ def schedule(c: Config) -> str:
     return f"\n{c.cycles} cycles of {c.updates} updates of batch {c.batch_size}"
 
 
-def curves(runs: list[Run], title: str, smooth: float, alone: bool) -> Figure:
-    """A panel for each environment: test success by epoch of every method in `runs`. alone: also
-    where there is a single one, and nothing to compare it with."""
+def curves(runs: list[Run], title: str, smooth: float) -> Figure:
+    """A panel for each environment in which there is something to compare VCP with or, if there is
+    none, for each environment: test success by epoch of every method in `runs`."""
     runs = sorted(runs, key=lambda r: (r.config.method != "vcp", label(r.config) != "VCP"))
     names = list(dict.fromkeys(label(run.config) for run in runs))
     by_env = defaultdict(lambda: defaultdict(list))
@@ -153,27 +154,32 @@ def curves(runs: list[Run], title: str, smooth: float, alone: bool) -> Figure:
         by_env[run.config.env + schedule(run.config)][label(run.config)].append(
             run.rows["test_success_rate"]
         )
-    compared = {env: methods for env, methods in by_env.items() if len(methods) > 1}
-    by_env = by_env if alone else compared or by_env
-    lines = -(-len(by_env) // 5)
-    columns = -(-len(by_env) // lines)
-    fig = Figure(figsize=(max(3.6 * columns, 5), 3.2 * lines + 0.6), layout="constrained")
-    panels = fig.subplots(lines, columns, squeeze=False).flat
+    compared = {env: its for env, its in by_env.items() if len(its) > 1 and "VCP" in its}
+    by_env = compared or by_env
+    columns = min(len(by_env), 3)
+    lines = -(-len(by_env) // columns)
+    fig = Figure(figsize=(8.3, 2.9 * lines + 1.1), layout="constrained")
+    panels = fig.subplots(lines, columns, squeeze=False, sharey=True).flat
+    entries = {}
     for ax, (env, methods) in zip(panels, sorted(by_env.items()), strict=False):
         for name, seeds in methods.items():
-            draw_line(ax, seeds, names.index(name), f"{name} ({len(seeds)})", smooth)
-        ax.set(title=env, xlabel="epoch", ylim=(-0.03, 1.03))
+            draw_line(ax, seeds, names.index(name), name, smooth)
+        few, many = min(map(len, methods.values())), max(map(len, methods.values()))
+        seeds = f"{few}" if few == many else f"{few} to {many}"
+        ax.set_title(f"{env}, {seeds} seed{'s' * (many > 1)}", fontsize=10)
+        ax.set(xlabel="epoch", ylim=(-0.03, 1.03))
         ax.xaxis.get_major_locator().set_params(integer=True)
         ax.grid(alpha=0.3)
-        ax.legend(fontsize=7)
+        entries |= dict(zip(*ax.get_legend_handles_labels()[::-1], strict=True))
     for ax in list(fig.axes)[len(by_env) :]:
         ax.axis("off")
+    in_order = [name for name in names if name in entries]
+    handles = [entries[name] for name in in_order]
+    fig.legend(handles, in_order, loc="outside lower center", ncols=3, fontsize=9, handlelength=3)
     how = f"; smoothed, weight {smooth}" if smooth else ""
-    fig.supylabel("test success rate", fontsize=9)
-    fig.suptitle(
-        f"{title}\nmean over seeds (how many: in brackets), with a 95 % interval from 5 on{how}",
-        fontsize=9,
-    )
+    fig.supylabel("test success rate", fontsize=10)
+    means = "mean over seeds, with a 95 % interval from 5 on"
+    fig.suptitle(f"{title}\n{means}; Appendix B's schedule unless said{how}", fontsize=10)
     return fig
 
 
@@ -274,7 +280,7 @@ def from_arrays(name: str, folder: Path) -> Figure:
 
 
 def draw(name: str, results: Path = RESULTS, smooth: float = 0.0) -> Path:
-    """Write results/NAME.png, or .md for the summary, and give its path."""
+    """Write NAME.png, or .md for the summary, into `results`, and give its path."""
     path = results / f"{name}.png"
     if name in ARRAYS:
         try:
@@ -284,8 +290,9 @@ def draw(name: str, results: Path = RESULTS, smooth: float = 0.0) -> Path:
         return path
     belongs = FIGURES[name][1] if name in FIGURES else lambda name: True
     chosen = [run for run in read_runs(results) if belongs(label(run.config))]
-    if not chosen:
-        sys.exit(f"figures.py: no runs for {name} in {results}")
+    kinds = {label(run.config) for run in chosen}
+    if len(kinds) < (2 if name in ("fig6", "fig7", "fig9") else 1):
+        sys.exit(f"figures.py: {name} compares runs that are not in {results}")
     if name == "summary":
         path = results / "summary.md"
         path.write_text(summary(chosen))
@@ -294,7 +301,7 @@ def draw(name: str, results: Path = RESULTS, smooth: float = 0.0) -> Path:
     if name == "fig4":
         fig = figure_4(chosen, smooth)
     else:
-        fig = curves(chosen, title, smooth, alone=name == "fig2")
+        fig = curves(chosen, title, smooth)
     fig.savefig(path, dpi=100)
     return path
 
@@ -309,13 +316,18 @@ def main() -> None:
     parser.add_argument(
         "--smooth", type=float, default=0.0, help="of the curves; the paper's: 0.9, or 0.6"
     )
+    parser.add_argument(
+        "--runs", type=Path, default=RESULTS, metavar="DIR", help="your own (default: results/)"
+    )
     given = parser.parse_args()
+    if not given.runs.is_dir():
+        parser.error(f"there is no folder {given.runs}")
     if given.name != "all":
-        print(draw(given.name, smooth=given.smooth))
+        print(draw(given.name, given.runs, given.smooth))
         return
     for name in NAMES:
         try:
-            print(draw(name, smooth=given.smooth))
+            print(draw(name, given.runs, given.smooth))
         except (SystemExit, ImportError) as missing:  # the others can be drawn
             print(missing, file=sys.stderr)
 

@@ -6,21 +6,30 @@
 A variant is a list of settings (the fields of harness.settings.Config), "" the defaults; --set goes
 for all runs. A run is in OUT/<env>/<its method and what differs>/seed<s>. Finished ones are skipped
 and broken ones resumed, so the same command goes on where it was stopped.
+
+    python -m experiments.sweep --plan experiments/paper.txt
+
+trains the runs of a file, whose lines are such arguments, one after the other in its order, without
+Ray. Started several times, on machines that share the folder, each takes the next that is free.
 """
 
 import argparse
 import os
+import shlex
+import signal
 import sys
+import traceback
 from collections.abc import Iterable
 from dataclasses import asdict, fields
 from pathlib import Path
+from statistics import median
 
 from tqdm import tqdm
 
 import run
 from harness import records
 from harness import settings as options
-from harness.errors import UsageError
+from harness.errors import FolderInUse, UsageError
 from harness.settings import Config
 from harness.tasks import make_env
 
@@ -70,20 +79,97 @@ def all_runs(
     for folder in folders:
         if folders.count(folder) > 1:
             raise UsageError(f"two runs are the same: {folder}")
-    for env in envs:
-        make_env(env).close()
     return runs
 
 
+def planned(file: Path, given: argparse.Namespace) -> list[Config]:
+    """The configs of a plan, in its order. A run may come again with more epochs. UsageError, with
+    the line's number, for one that is no list of arguments or cannot be run."""
+    try:
+        lines = file.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"cannot read {file}: {error}") from error
+    parser = argparse.ArgumentParser(add_help=False, exit_on_error=False, parents=[WHICH])
+    runs = []
+    for number, line in enumerate(lines, 1):
+        try:
+            arguments = shlex.split(line, comments=True)
+            if not arguments:
+                continue
+            its, unknown = parser.parse_known_args(arguments)
+            if unknown or not its.env:
+                raise UsageError(f"unknown: {' '.join(unknown)}" if unknown else "no --env")
+            common = {**settings(its.set), "num_workers": given.cores}
+            runs += all_runs(its.env, its.variants, its.seeds, common, Path(given.out))
+        except (argparse.ArgumentError, ValueError) as error:
+            raise UsageError(f"{file}, line {number}: {error}") from error
+    return runs
+
+
+def check_environments(runs: list[Config]) -> None:
+    """UsageError for an environment that cannot be learned in."""
+    for env in dict.fromkeys(config.env for config in runs):
+        make_env(env).close()
+
+
+def hours_left(runs: list[Config]) -> str:
+    """How long the runs that are not whole take, by the time that an epoch of theirs took so far
+    or, of one that has not begun, of others of its environment and method."""
+    hours: dict[tuple, list[float]] = {}
+
+    def alike(config):
+        return config.env, config.method, config.heads, config.cycles, config.updates
+
+    for config in {config.out: config for config in runs}.values():
+        if epochs_done(config):
+            rows = records.read_rows(Path(config.out))
+            hours.setdefault(alike(config), []).append(rows[-1]["wall_seconds"] / len(rows) / 3600)
+    last = {config.out: config for config in sorted(runs, key=lambda config: config.epochs)}
+    left = [config for config in last.values() if epochs_done(config) < config.epochs]
+    known = [config for config in left if alike(config) in hours]
+    total = sum(median(hours[alike(c)]) * (c.epochs - epochs_done(c)) for c in known)
+    text = f"{len(left)} of {len(last)} runs are left"
+    text += f"; {len(known)} of them need {total:.1f} core-hours" if known else ""
+    return text + (f"; {len(left) - len(known)} are of a kind not timed yet" if left else "")
+
+
 def train_one(config: Config, here: str = ".") -> None:
-    """Start the run, or go on with it if it was broken off. UsageError if the folder holds a run
-    with other settings. here: what a relative folder is relative to."""
+    """Start the run, or go on with it if it was broken off. If it fails, error.txt in its folder
+    says why. UsageError if the folder holds a run with other settings. here: what a relative folder
+    is relative to."""
     os.chdir(here)
     folder = Path(config.out)
     resume = (folder / "config.json").exists()
-    if resume:
-        config = options.changed(options.load(folder), asdict(config))
-    run.train(config, resume=resume)
+    note = folder / "error.txt"
+    try:
+        if resume:
+            config = options.changed(options.load(folder), asdict(config))
+        run.train(config, resume=resume)
+        note.unlink(missing_ok=True)
+    except FolderInUse:
+        raise
+    except Exception:
+        folder.mkdir(parents=True, exist_ok=True)
+        note.write_text(traceback.format_exc())
+        raise
+
+
+def in_order(runs: list[Config]) -> dict:
+    """Train the runs one after the other, in this process, and pass over those that another one
+    trains. The errors of those that failed, by folder."""
+    failed = {}
+    for i, config in enumerate(runs):
+        if epochs_done(config) >= config.epochs or config.out in failed:
+            continue
+        print(hours_left(runs[i:]))
+        print(f"now {config.out}, {epochs_done(config)} of {config.epochs} epochs", flush=True)
+        try:
+            train_one(config, os.getcwd())
+        except FolderInUse as error:
+            print(error)
+        except Exception as error:  # the others can be trained
+            failed[config.out] = f"{type(error).__name__}: {error}"
+    return failed
 
 
 def in_ray(runs: list[Config], cores: float, gpus: float, address: str | None) -> dict:
@@ -120,12 +206,18 @@ def epochs_done(config: Config) -> int:
     return records.epochs_done(Path(config.out))
 
 
+WHICH = argparse.ArgumentParser(add_help=False)  # the runs: arguments, and lines of a plan
+WHICH.add_argument("--env", nargs="+")
+WHICH.add_argument("--variants", nargs="+", default=[""], metavar="NAME=VALUE,...")
+WHICH.add_argument("--set", default="", metavar="NAME=VALUE,...", help="for all runs")
+WHICH.add_argument("--seeds", type=seeds, default="0", help="such as 0-4 or 0,3 (default: 0)")
+
+
 def main(argv: Iterable[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="sweep.py", description=__doc__.split("\n")[0])
-    parser.add_argument("--env", nargs="+", required=True)
-    parser.add_argument("--variants", nargs="+", default=[""], metavar="NAME=VALUE,...")
-    parser.add_argument("--set", default="", metavar="NAME=VALUE,...", help="for all runs")
-    parser.add_argument("--seeds", type=seeds, default="0", help="such as 0-4 or 0,3 (default: 0)")
+    parser = argparse.ArgumentParser(
+        prog="sweep.py", description=__doc__.split("\n")[0], parents=[WHICH]
+    )
+    parser.add_argument("--plan", metavar="FILE", help="in place of --env: lines of the above")
     parser.add_argument("--out", default="runs", help="default: runs")
     parser.add_argument("--cores", type=int, default=1, help="of each run (default: 1)")
     parser.add_argument("--gpus", type=float, default=0, help="share of each run (default: 0)")
@@ -134,8 +226,14 @@ def main(argv: Iterable[str] | None = None) -> None:
     parser.add_argument("--task", type=int, help="train this one of --list here, without Ray")
     given = parser.parse_args(argv)
     try:
-        common = {**settings(given.set), "num_workers": given.cores}
-        runs = all_runs(given.env, given.variants, given.seeds, common, Path(given.out))
+        if bool(given.plan) == bool(given.env):
+            raise UsageError("one of --env and --plan is needed")
+        if given.plan:
+            runs = planned(Path(given.plan), given)
+        else:
+            common = {**settings(given.set), "num_workers": given.cores}
+            runs = all_runs(given.env, given.variants, given.seeds, common, Path(given.out))
+        check_environments(runs)
         if given.task is not None:
             if not 0 <= given.task < len(runs):
                 raise UsageError(f"--task {given.task}: there are {len(runs)} runs, see --list")
@@ -145,16 +243,22 @@ def main(argv: Iterable[str] | None = None) -> None:
     if given.list:
         for i, config in enumerate(runs):
             print(f"{i:4} {epochs_done(config):4} of {config.epochs} epochs  {config.out}")
+        print(hours_left(runs), file=sys.stderr)
         return None
     left = [config for config in runs if epochs_done(config) < config.epochs]
-    failed = in_ray(left, given.cores, given.gpus, given.address) if left else {}
-    print(f"{len(runs) - len(failed)} of {len(runs)} runs are whole")
+    if given.plan:
+        failed = in_order(left)
+    else:
+        failed = in_ray(left, given.cores, given.gpus, given.address) if left else {}
+    whole = sum(epochs_done(config) >= config.epochs for config in runs)
+    print(f"{whole} of {len(runs)} runs are whole")
     for folder, error in failed.items():
-        print(f"FAILED {folder}: {error}")
+        print(f"FAILED {folder}: {error} (error.txt there)")
     sys.exit(1 if failed else 0)
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         main()
     except KeyboardInterrupt:

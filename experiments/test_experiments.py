@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 
 from ensemble import MultiHeadMLP, linear
 from experiments import didactic, figures, inspect_run, sweep
@@ -18,7 +19,7 @@ from harness.assemble import restored
 from harness.errors import UsageError
 from harness.records import COLUMNS, epochs_done, read_checkpoint
 from harness.settings import METHODS, Config
-from harness.tasks import examine
+from harness.tasks import PAPER_ENVS, examine
 from harness.testing import without_timing
 from her import EpisodeBuffer
 from run import train
@@ -71,14 +72,14 @@ def results(tmp_path):
         (
             "fig2",
             [
-                "VCP (2)",
-                "HER, 16 times the updates (2)",
-                *(f"{m.upper()} (2)" for m in figures.BASELINES),
+                "VCP",
+                "HER, 16 times the updates",
+                *(f"{m.upper()}" for m in figures.BASELINES),
             ],
         ),
-        ("fig9", ["VCP (2)", *(f"{m.upper()}, 16 heads (2)" for m in figures.BASELINES)]),
-        ("fig6", ["VCP (2)", "VCP, uniform priority (2)", "VCP, one acting head (2)"]),
-        ("fig7", ["VCP (2)", "VCP, 4 heads (2)"]),
+        ("fig9", ["VCP", *(f"{m.upper()}, 16 heads" for m in figures.BASELINES)]),
+        ("fig6", ["VCP", "VCP, uniform priority", "VCP, one acting head"]),
+        ("fig7", ["VCP", "VCP, 4 heads"]),
     ],
 )
 def test_each_figure_has_its_runs(name, lines, results, monkeypatch):
@@ -87,17 +88,37 @@ def test_each_figure_has_its_runs(name, lines, results, monkeypatch):
     def keep(*args, **kwargs):
         fig = curves(*args, **kwargs)
         for ax in fig.axes:
-            drawn[ax.get_title()] = [line.get_text() for line in ax.get_legend().get_texts()]
+            drawn[ax.get_title()] = [line.get_label() for line in ax.get_lines()]
+        legend = [text.get_text() for text in fig.legends[0].get_texts()]
+        assert set(legend) == {name for names in drawn.values() for name in names}
         return fig
 
     curves = figures.curves
     monkeypatch.setattr(figures, "curves", keep)
     path = figures.draw(name, results, smooth=0.5)
     assert path.read_bytes()[:4] == b"\x89PNG"
-    assert sorted(drawn.pop("FetchReach-v1")) == sorted(drawn.pop("Reacher-v2")) == sorted(lines)
-    # another schedule is another panel, which says so
-    alone = {"FetchReach-v1\n5 cycles of 2 updates of batch 64": ["VCP (1)"]}
-    assert drawn == (alone if name == "fig2" else {})
+    # another schedule is another panel, drawn where it has something to compare VCP with
+    assert sorted(drawn) == ["FetchReach-v1, 2 seeds", "Reacher-v2, 2 seeds"]
+    assert all(sorted(drawn[panel]) == sorted(lines) for panel in drawn)
+
+
+def test_ones_own_runs_are_drawn(tmp_path, monkeypatch, capsys):
+    make_run(tmp_path / "mine", epochs=1, env="FetchReach-v1", updates=2)
+    monkeypatch.setattr(sys, "argv", ["figures", "all", "--runs", str(tmp_path)])
+    drawn, draw_line = [], figures.draw_line
+    monkeypatch.setattr(figures, "draw_line", lambda ax, *a: drawn.append(ax) or draw_line(ax, *a))
+    figures.main()
+    out, err = capsys.readouterr()
+    assert out.split() == [str(tmp_path / "fig2.png"), str(tmp_path / "summary.md")]
+    for name in ("fig3", "fig4", "fig6", "fig7", "fig9"):
+        assert name in err
+    (line,) = drawn[0].get_lines()
+    assert line.get_marker() == "o"  # of one epoch there is no line to be seen
+    title = drawn[0].get_title()
+    assert "2 updates" in title and title.endswith("1 seed")
+    monkeypatch.setattr(sys, "argv", ["figures", "all", "--runs", str(tmp_path / "nowhere")])
+    with pytest.raises(SystemExit):
+        figures.main()
 
 
 @pytest.mark.parametrize(
@@ -353,7 +374,7 @@ def test_a_sweep_of_what_cannot_be_run_is_refused(wrong, capsys):
     error = capsys.readouterr().err.splitlines()[-1]
     assert stop.value.code == 2 and named in error.split("error:")[1]
     with pytest.raises(UsageError):
-        sweep.all_runs(["Nowhere-v0"], [""], [0], {}, sweep.Path("runs"))
+        sweep.check_environments([Config(env="Nowhere-v0")])
 
 
 def folder_of(root, seed=0, **settings_of):
@@ -385,6 +406,110 @@ def test_a_task_of_a_sweep_is_skipped_done_or_gone_on_with(tmp_path, capsys):
     capsys.readouterr()
     sweep.main(arguments(tmp_path / "b", "--list"))
     assert [line.split()[1] for line in capsys.readouterr().out.splitlines()] == ["0", "2"]
+
+
+PLAN = f"""
+# the runs below are few
+--env PointMassEmptyEnv-v1 --variants "" priority=uniform --set {SMALL}
+--env PointMassEmptyEnv-v1 --set {SMALL.replace("epochs=2", "epochs=3")}
+"""
+
+
+def test_a_plan_is_done_in_its_order_and_gone_on_with(tmp_path, capsys):
+    plan, out = tmp_path / "plan.txt", tmp_path / "runs"
+    plan.write_text(PLAN)
+    arguments = ["--plan", str(plan), "--out", str(out)]
+    first, second = folder_of(out), folder_of(out, priority="uniform")
+    second.mkdir(parents=True)
+    with FileLock(second / ".lock"), pytest.raises(SystemExit) as stop:  # another process has it
+        sweep.main(arguments)
+    text = capsys.readouterr().out
+    assert stop.value.code == 0 and "2 of 3 runs are whole" in text
+    assert f"another process trains in {second}" in text and not (second / "error.txt").exists()
+    assert epochs_done(first) == 3
+    assert text.index(f"now {first}, 0 of 2") < text.index(f"now {second}, 0 of 2")
+    assert text.index(f"now {second}, 0 of 2") < text.index(f"now {first}, 2 of 3")
+    with pytest.raises(SystemExit):
+        sweep.main(arguments)
+    text = capsys.readouterr().out
+    assert f"now {first}" not in text and "3 of 3 runs are whole" in text
+    sweep.main([*arguments, "--list"])
+    assert [line.split()[1] for line in capsys.readouterr().out.splitlines()] == ["3", "2", "3"]
+
+
+def test_a_run_that_fails_says_why_in_its_folder_and_the_next_is_trained(
+    tmp_path, capsys, monkeypatch
+):
+    plan, out = tmp_path / "plan.txt", tmp_path / "runs"
+    plan.write_text(PLAN)
+    train = sweep.run.train
+
+    def fails(config, resume):
+        if config.priority == "uniform":
+            raise FloatingPointError("NaN or Inf in the test")
+        return train(config, resume)
+
+    monkeypatch.setattr(sweep.run, "train", fails)
+    with pytest.raises(SystemExit) as stop:
+        sweep.main(["--plan", str(plan), "--out", str(out)])
+    broken = folder_of(out, priority="uniform")
+    assert (
+        stop.value.code == 1 and f"FAILED {broken}: FloatingPointError" in capsys.readouterr().out
+    )
+    error = (broken / "error.txt").read_text()
+    assert "Traceback" in error and "NaN or Inf in the test" in error
+    assert epochs_done(folder_of(out)) == 3
+    monkeypatch.setattr(sweep.run, "train", train)
+    with pytest.raises(SystemExit) as stop:
+        sweep.main(["--plan", str(plan), "--out", str(out)])
+    assert stop.value.code == 0 and not (broken / "error.txt").exists()
+
+
+def test_the_hours_that_are_left(tmp_path):
+    """Of epochs of 90 seconds, 4 of the run that has 6 of 10, and 2 x 10 of seeds not begun."""
+    make_run(tmp_path / "a", epochs=6, of=10, env="FetchReach-v1")
+    common = {"env": "FetchReach-v1", "epochs": 10}
+    runs = [Config(**common, seed=seed, out=str(tmp_path / "abc"[seed])) for seed in range(3)]
+    runs.append(Config(env="Reacher-v2", epochs=10, out=str(tmp_path / "d")))
+    runs.append(Config(env="FetchReach-v1", epochs=6, out=str(tmp_path / "a")))
+    said = sweep.hours_left([settings.complete(config) for config in runs])
+    assert said == (
+        "4 of 4 runs are left; 3 of them need 0.6 core-hours; 1 are of a kind not timed yet"
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("--env PointMassEmptyEnv-v1 --variants heads=0", "line 2: --heads must be"),
+        ("--env PointMassEmptyEnv-v1 --colour red", "line 2: unknown: --colour red"),
+        ("--seeds 0-2", "line 2: no --env"),
+        ('--env "PointMass', "line 2: No closing quotation"),
+        ("--env PointMassEmptyEnv-v1 --seeds many", "line 2: argument --seeds"),
+        ("--env Nowhere-v0", "cannot make the environment Nowhere-v0"),
+    ],
+)
+def test_a_plan_of_what_cannot_be_run_is_refused(line, message, tmp_path, capsys):
+    plan = tmp_path / "plan.txt"
+    plan.write_text(f"# nothing\n{line}\n")
+    with pytest.raises(SystemExit) as stop:
+        sweep.main(["--plan", str(plan), "--out", str(tmp_path / "runs")])
+    assert stop.value.code == 2 and message in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "runs").exists()
+
+
+def test_the_papers_plan_is_its_whole_comparison():
+    given = SimpleNamespace(cores=1, out="runs")
+    runs = sweep.planned(sweep.ROOT / "experiments" / "paper.txt", given)
+    names = {(config.env, settings.variant(config)) for config in runs}
+    assert {env for env, _ in names} == set(PAPER_ENVS)
+    for env in PAPER_ENVS:
+        others = [f"{method}_heads-1" for method in ("her", "herebp", "cher", "dtgsh")]
+        its = ["vcp", "vcp_priority-uniform", "vcp_priority-variance", "vcp_acting_head-one"]
+        assert {(env, name) for name in (*its, *others, *METHODS)} <= names
+    last = {(config.env, settings.variant(config), config.seed): config.epochs for config in runs}
+    assert last["HandManipulateEggRotate-v0", "vcp", 9] == 50
+    assert runs[0].env == "FetchPush-v1" and runs[0].epochs == 20
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ import torch
 from filelock import FileLock, Timeout
 from tqdm.auto import tqdm
 
-from harness.errors import UsageError
+from harness.errors import FolderInUse, UsageError
 
 COLUMNS = [
     "epoch",
@@ -164,7 +164,7 @@ def held(folder: Path, config: dict, rows: list[dict], resume: bool) -> Iterator
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except Timeout as error:
-        raise UsageError(f"another process trains in {folder}") from error
+        raise FolderInUse(f"another process trains in {folder}") from error
     except OSError as error:
         raise UsageError(f"cannot write to {folder}: {error.strerror or error}") from error
     try:
