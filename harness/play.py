@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from PIL import Image
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from ensemble import EnsembleDDPG
 from harness import numerics
