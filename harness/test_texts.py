@@ -1,13 +1,18 @@
-"""Tests of README.md and NOTES.md: what they show runs, what they name is there."""
+"""Tests of README.md, NOTES.md and the other texts: what they show runs and is there."""
 
+import importlib
 import re
+import shlex
+import shutil
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
-from harness import settings
+import run
+from harness import cli, settings
+from harness.play import play
 from harness.testing import HERE, exact_reward, numbered_episodes
 
 TEXTS = sorted(
@@ -15,7 +20,28 @@ TEXTS = sorted(
     for file in HERE.rglob("*.md")
     if not any(part.startswith((".", "runs")) for part in file.relative_to(HERE).parts)
 )
-SNIPPETS = re.findall(r"```python\n(.*?)```", (HERE / "README.md").read_text(), re.S)
+SNIPPETS = [
+    text for file in TEXTS for text in re.findall(r"```python\n(.*?)```", file.read_text(), re.S)
+]
+TINY = (
+    "--epochs 1 --cycles 1 --updates 1 --batch-size 16 --eval-episodes 16 --num-workers 1".split()
+)
+COMMAND = r"(?:exec )?(?:python )?(run\.py|-m experiments\.\w+|figures|didactic|bench)((?: .*)?)$"
+
+
+def commands() -> list[str]:
+    """The programs that the texts show with their arguments, each once: `run.py --env ...`."""
+    found = {}
+    for file in TEXTS:
+        text = re.sub(r"```python\n.*?```\n", "", file.read_text(), flags=re.S)
+        blocks = re.findall(r"```\n(.*?)```", text, re.S)
+        shown = [line for block in blocks for line in block.splitlines()]
+        inline = re.findall(r"`([^`]+)`", re.sub(r"```.*?```", "", text, flags=re.S))
+        for line in [*shown, *(" ".join(code.split()) for code in inline)]:
+            if match := re.match(COMMAND, line):
+                program, arguments = match.groups()
+                found[f"{program.removeprefix('-m experiments.')}{arguments}"] = None
+    return [*found]
 
 
 def test_the_snippet_to_copy_runs():
@@ -60,3 +86,48 @@ def test_links_lead_somewhere_and_options_exist(file):
     known |= {"--resume", "--play", "--gif", "--policy", "--help"}
     for command in re.findall(r"run\.py ([^`\n]*)", text):
         assert set(re.findall(r"--[a-z-]+", command)) <= known, command
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", commands())
+def test_the_commands_that_are_shown_run(command, whole, tmp_path, monkeypatch, capsys):
+    """With tiny settings in place of hours; the DIR is that of a small run."""
+    monkeypatch.chdir(HERE)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    folder = shutil.copytree(whole, tmp_path / "run")
+    for name, value in (("DIR", folder), ("NAME", "fig2"), ("ID", "PointMassEmptyEnv-v1")):
+        command = re.sub(rf"\b{name}\b", str(value), command)
+    command = re.sub(r"\bRATE\b", "0.5", re.sub(r"\bS\b", "1", re.sub(r"\.\.\.|[][]", "", command)))
+    program, *arguments = shlex.split(command)
+    if program == "run.py":
+        if not {"--resume", "--play", "--help"} & {*arguments}:
+            if "panda_gym" in command:
+                pytest.importorskip("panda_gym")
+            arguments += [*TINY, "--out", str(tmp_path / "new")]
+        try:
+            cli.main(run.train, arguments)
+        except SystemExit as stop:
+            assert not stop.code and "--help" in arguments
+        assert "--env" not in arguments or (tmp_path / "new" / "curve.png").exists()
+        return
+    if program == "sweep":
+        if arguments == []:
+            return  # its arguments are left out
+        arguments += ["--list", "--out", str(tmp_path / "runs")]
+    elif program == "figures":
+        arguments += ["--runs", str(tmp_path)]  # those of other tests draw more
+    elif program != "inspect_run":
+        arguments += ["--help"]
+    monkeypatch.setattr(sys, "argv", [program, *arguments])
+    try:
+        importlib.import_module(f"experiments.{program}").main()
+    except SystemExit as stop:
+        nothing_there = program == "figures" and "figures.py: " in str(stop.code)
+        assert not stop.code or nothing_there, (stop.code, capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("policy", sorted(HERE.glob("results/**/policy.npz")), ids=str)
+def test_the_policies_in_results_reach_their_goals(policy, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    assert policy.stat().st_size < 1_000_000
+    assert play(policy) >= 0.9
