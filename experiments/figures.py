@@ -287,6 +287,8 @@ def draw(name: str, results: Path = RESULTS, smooth: float = 0.0) -> Path:
             from_arrays(name, results / "didactic").savefig(path, dpi=100)
         except FileNotFoundError as error:
             sys.exit(f"figures.py: {error.filename or error} is missing: experiments.didactic")
+        except ModuleNotFoundError as error:
+            sys.exit(f"figures.py: {name}: {error}: pip install -r requirements-experiments.txt")
         return path
     belongs = FIGURES[name][1] if name in FIGURES else lambda name: True
     chosen = [run for run in read_runs(results) if belongs(label(run.config))]
@@ -328,7 +330,7 @@ def main() -> None:
     for name in NAMES:
         try:
             print(draw(name, given.runs, given.smooth))
-        except (SystemExit, ImportError) as missing:  # the others can be drawn
+        except SystemExit as missing:  # the others can be drawn
             print(missing, file=sys.stderr)
 
 

@@ -175,7 +175,10 @@ def in_order(runs: list[Config]) -> dict:
 def in_ray(runs: list[Config], cores: float, gpus: float, address: str | None) -> dict:
     """Train all of them as tasks of Ray, which tries again what is lost with its worker. The errors
     of those that failed, by folder."""
-    import ray
+    try:
+        import ray
+    except ModuleNotFoundError:
+        sys.exit("sweep.py: Ray is missing: pip install -r requirements-experiments.txt, or --task")
 
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # it would report to its makers
     ray.init(

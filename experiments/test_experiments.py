@@ -284,10 +284,23 @@ def test_the_trunk_outlives_the_first_cycle(tmp_path, capsys):
     assert line[1] == "1" and int(line[2].rstrip("%")) < 30
 
 
+def test_what_is_not_installed_is_said(tmp_path, monkeypatch):
+    for module in ("ray", "scipy.stats", "sklearn.manifold"):
+        monkeypatch.setitem(sys.modules, module, None)  # importing it fails
+    with pytest.raises(SystemExit, match=r"Ray is missing: pip install"):
+        sweep.main(arguments(tmp_path))
+    arrays = {"fig5_consistency": {}, "fig5_variance": {}}
+    (tmp_path / "didactic").mkdir()
+    for name, its in arrays.items():
+        np.savez(tmp_path / "didactic" / f"{name}.npz", **its)
+    with pytest.raises(SystemExit, match=r"fig5.*pip install"):
+        figures.draw("fig5", tmp_path)
+
+
 def test_no_runs_is_said(tmp_path):
     with pytest.raises(SystemExit, match=r"fig3\.npz is missing"):
         figures.draw("fig3", tmp_path)
-    with pytest.raises(SystemExit, match="no runs for fig2"):
+    with pytest.raises(SystemExit, match="fig2 compares runs that are not in"):
         figures.draw("fig2", tmp_path)
 
 
