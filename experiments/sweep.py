@@ -158,10 +158,10 @@ def in_order(runs: list[Config]) -> dict:
     """Train the runs one after the other, in this process, and pass over those that another one
     trains. The errors of those that failed, by folder."""
     failed = {}
-    for i, config in enumerate(runs):
+    for config in runs:
         if epochs_done(config) >= config.epochs or config.out in failed:
             continue
-        print(hours_left(runs[i:]))
+        print(hours_left(runs))
         print(f"now {config.out}, {epochs_done(config)} of {config.epochs} epochs", flush=True)
         try:
             train_one(config, os.getcwd())
@@ -250,7 +250,7 @@ def main(argv: Iterable[str] | None = None) -> None:
         return None
     left = [config for config in runs if epochs_done(config) < config.epochs]
     if given.plan:
-        failed = in_order(left)
+        failed = in_order(runs)
     else:
         failed = in_ray(left, given.cores, given.gpus, given.address) if left else {}
     whole = sum(epochs_done(config) >= config.epochs for config in runs)

@@ -442,6 +442,8 @@ def test_a_plan_is_done_in_its_order_and_gone_on_with(tmp_path, capsys):
     assert epochs_done(first) == 3
     assert text.index(f"now {first}, 0 of 2") < text.index(f"now {second}, 0 of 2")
     assert text.index(f"now {second}, 0 of 2") < text.index(f"now {first}, 2 of 3")
+    assert "2 of 2 runs are left; 2 are of a kind not timed yet" in text
+    assert text.count("2 of 2 runs are left; 2 of them need 0.0 core-hours; 0 are") == 2
     with pytest.raises(SystemExit):
         sweep.main(arguments)
     text = capsys.readouterr().out
