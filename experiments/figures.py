@@ -314,7 +314,7 @@ NAMES = [*sorted([*FIGURES, *ARRAYS]), "summary"]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("name", choices=[*NAMES, "all"])
+    parser.add_argument("name", choices=[*NAMES, "all"], help="the picture, or the table, to make")
     parser.add_argument(
         "--smooth", type=float, default=0.0, help="of the curves; the paper's: 0.9, or 0.6"
     )

@@ -210,8 +210,14 @@ def epochs_done(config: Config) -> int:
 
 
 WHICH = argparse.ArgumentParser(add_help=False)  # the runs: arguments, and lines of a plan
-WHICH.add_argument("--env", nargs="+")
-WHICH.add_argument("--variants", nargs="+", default=[""], metavar="NAME=VALUE,...")
+WHICH.add_argument("--env", nargs="+", help="one or more, as for run.py")
+WHICH.add_argument(
+    "--variants",
+    nargs="+",
+    default=[""],
+    metavar="NAME=VALUE,...",
+    help='one or more, each the settings that differ; "" is run.py\'s defaults (default: "")',
+)
 WHICH.add_argument("--set", default="", metavar="NAME=VALUE,...", help="for all runs")
 WHICH.add_argument("--seeds", type=seeds, default="0", help="such as 0-4 or 0,3 (default: 0)")
 
