@@ -60,6 +60,8 @@ def results(tmp_path):
             for seed in range(2):
                 folder = tmp_path / env / name / f"seed{seed}"
                 make_run(folder, epochs=6 + seed, env=env, seed=seed, **given)
+    for method in ("her", "cher"):  # nothing to compare VCP with
+        make_run(tmp_path / "push" / method, env="FetchPush-v1", method=method, heads=1)
     make_run(tmp_path / "small", env="FetchReach-v1", updates=2)
     make_run(tmp_path / "just-begun", epochs=0, env="FetchReach-v1")
     make_run(tmp_path / "stopped", epochs=2, of=6, env="Reacher-v2", trunk_rate=0.5)

@@ -6,8 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from ensemble import EnsembleDDPG
+from envs_point import PointMass
 from harness import play as module
 from harness import records
 from harness.errors import UsageError
@@ -91,10 +94,33 @@ def test_what_is_looked_at_ends_at_the_goal_and_what_is_counted_does_not():
     assert not success and len(frames) == 50
 
 
-def test_mujocos_window_comes_without_its_menu():
+def test_mujocos_window_comes_without_its_menu(monkeypatch):
     viewer = SimpleNamespace(_hide_menu=False)
-    hide_menu(
-        SimpleNamespace(unwrapped=SimpleNamespace(mujoco_renderer=SimpleNamespace(viewer=viewer)))
-    )
+    renderer = SimpleNamespace(viewer=viewer)
+    hide_menu(SimpleNamespace(unwrapped=SimpleNamespace(mujoco_renderer=renderer)))
     assert viewer._hide_menu
-    hide_menu(make_env("PointMassEmptyEnv-v1"))
+    hide_menu(make_env("PointMassEmptyEnv-v1"))  # it has none
+    hidden = []
+    monkeypatch.setattr(module, "hide_menu", hidden.append)
+    monkeypatch.setattr(PointMass, "render", lambda self: None)
+    env = make_env("PointMassEmptyEnv-v1", render_mode="human")
+    still = SimpleNamespace(act=lambda obs, goal, heads: 0 * obs)
+    episode(env, still, 0, seed=0)
+    assert hidden == [env]
+
+
+def test_playing_takes_one_thread(whole, monkeypatch):
+    """With more, each action waits for every core that is busy."""
+    threads, act = set(), EnsembleDDPG.act
+
+    def noted(self, *args):
+        threads.add(torch.get_num_threads())
+        return act(self, *args)
+
+    monkeypatch.setattr(EnsembleDDPG, "act", noted)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    play(whole)
+    assert threads == {1} and torch.get_num_threads() == 2
+    torch.set_num_threads(before)
