@@ -3,7 +3,9 @@
 import csv
 import importlib.util
 import json
+import signal
 import sys
+import time
 from dataclasses import asdict
 from types import SimpleNamespace
 
@@ -20,7 +22,7 @@ from harness.errors import UsageError
 from harness.records import COLUMNS, epochs_done, read_checkpoint
 from harness.settings import METHODS, Config
 from harness.tasks import PAPER_ENVS, examine
-from harness.testing import without_timing
+from harness.testing import finish, start, without_timing
 from her import EpisodeBuffer
 from run import train
 from vcp import value_consistency_priority
@@ -480,6 +482,27 @@ def test_a_run_that_fails_says_why_in_its_folder_and_the_next_is_trained(
     with pytest.raises(SystemExit) as stop:
         sweep.main(["--plan", str(plan), "--out", str(out)])
     assert stop.value.code == 0 and not (broken / "error.txt").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_plan_that_is_told_to_stop_loses_no_whole_epoch(name, tmp_path):
+    plan, out = tmp_path / "plan.txt", tmp_path / "runs"
+    its = SMALL.replace("epochs=2", "epochs=100000")
+    plan.write_text(f"--env PointMassEmptyEnv-v1 --set {its}")
+    process = start("--plan", plan, "--out", out, module="experiments.sweep")
+    folder = folder_of(out)
+    while epochs_done(folder) < 1 and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(getattr(signal, name))
+    code, text, err = finish(process)
+    assert code == 1 and err == "sweep.py: stopped; the same command goes on\n"
+    assert f"now {folder}, 0 of 100000 epochs" in text and not (folder / "error.txt").exists()
+    done = epochs_done(folder)
+    plan.write_text(f"--env PointMassEmptyEnv-v1 --set {SMALL.replace('=2', f'={done + 1}', 1)}")
+    code, text, err = finish(start("--plan", plan, "--out", out, module="experiments.sweep"))
+    assert code == 0 and f"now {folder}, {done} of {done + 1} epochs" in text, err
+    assert epochs_done(folder) == done + 1
 
 
 def test_the_hours_that_are_left(tmp_path):

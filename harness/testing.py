@@ -144,16 +144,17 @@ SMALL = {
 ARGUMENTS = [f"{settings.flag(k)}={v}" for k, v in SMALL.items()]
 
 
-def start(*arguments, program=None, limit=None):
-    """run.py (or a program's text) in a process and session of its own, which Ctrl-C reaches even
-    if these tests run in the background; with a limit on the size of the files it may write."""
+def start(*arguments, program=None, module=None, limit=None):
+    """run.py (or a program's text, or a module) in a process and session of its own, which Ctrl-C
+    reaches even if these tests run in the background; with a limit on the size of the files it may
+    write."""
 
     def prepare():
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         if limit:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    what = ["-c", program] if program else [str(HERE / "run.py")]
+    what = ["-c", program] if program else ["-m", module] if module else [str(HERE / "run.py")]
     return subprocess.Popen(
         [sys.executable, *what, *map(str, arguments)],
         stdout=subprocess.PIPE,
