@@ -991,8 +991,9 @@ def test_every_option_runs_to_the_end(options, tmp_path):
 
 @pytest.mark.slow
 def test_point_mass_is_learned_and_not_without_relabelling(tmp_path):
-    settings = {"env": "PointMassEmptyEnv-v1", "epochs": 3, "updates": 5, "batch_size": 64}
-    learned = train(Config(**settings, out=str(tmp_path / "her")))
-    assert max(row["test_success_rate"] for row in learned) >= 0.9
-    control = train(Config(**settings, relabel_ratio=0.0, out=str(tmp_path / "no")))
-    assert max(row["test_success_rate"] for row in control) < 0.5
+    settings = {"env": "PointMassEmptyEnv-v1", "epochs": 1, "updates": 5, "batch_size": 64}
+    settings |= {"cycles": 20, "action_penalty": 0.1}  # with 1 it takes ten times as long
+    (learned,) = train(Config(**settings, out=str(tmp_path / "her")))
+    assert learned["test_success_rate"] >= 0.9
+    (control,) = train(Config(**settings, relabel_ratio=0.0, out=str(tmp_path / "no")))
+    assert control["test_success_rate"] < 0.1
