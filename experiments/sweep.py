@@ -148,7 +148,9 @@ def train_one(config: Config, here: str = ".") -> None:
         note.unlink(missing_ok=True)
     except FolderInUse:
         raise
-    except Exception:
+    except Exception as error:
+        if isinstance(error, UsageError) and not resume and (folder / "config.json").exists():
+            raise FolderInUse(f"another process was the first in {folder}") from error
         folder.mkdir(parents=True, exist_ok=True)
         note.write_text(traceback.format_exc())
         raise

@@ -484,6 +484,24 @@ def test_a_run_that_fails_says_why_in_its_folder_and_the_next_is_trained(
     assert stop.value.code == 0 and not (broken / "error.txt").exists()
 
 
+def test_a_run_that_another_process_begins_meanwhile_is_left_to_it(tmp_path, capsys, monkeypatch):
+    """Many that start at once all find the first run free, and one is the first in its folder."""
+    plan, out = tmp_path / "plan.txt", tmp_path / "runs"
+    plan.write_text(PLAN)
+    train, first = sweep.run.train, folder_of(out)
+
+    def late(config, resume):
+        if config.out == str(first) and not resume:
+            train(config, resume)  # the other's
+        return train(config, resume)
+
+    monkeypatch.setattr(sweep.run, "train", late)
+    with pytest.raises(SystemExit) as stop:
+        sweep.main(["--plan", str(plan), "--out", str(out)])
+    assert stop.value.code == 0 and "another process was the first in" in capsys.readouterr().out
+    assert not (first / "error.txt").exists()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_plan_that_is_told_to_stop_loses_no_whole_epoch(name, tmp_path):

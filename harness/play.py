@@ -70,17 +70,18 @@ def show(about: dict, agent: EnsembleDDPG, head: int, seeds: range, gif: str | N
         env = make_env(about["env"], about["episode_length"], render_mode=mode)
         shown = [episode(env, agent, head, seed)[1] for seed in seeds]
         env.close()
-        if gif:
-            octree = Image.Quantize.FASTOCTREE  # keeps the colour of something as small as a goal
-            frames = [Image.fromarray(frame) for frames in shown for frame in frames]
-            images = [frame.resize((PIXELS, PIXELS)).quantize(64, octree) for frame in frames]
-            images[0].save(gif, save_all=True, append_images=images[1:], duration=60, loop=0)
-            print(f"{gif}: {len(seeds)} episodes, {os.path.getsize(gif) // 1024} KB")
-    except OSError as error:
-        raise UsageError(f"cannot write {gif}: {error.strerror or error}") from error
     except Exception as error:  # MuJoCo's renderers raise many kinds without a display or a driver
         hint = "without a display, set MUJOCO_GL=egl (a GPU's driver) or osmesa (libosmesa6)"
         raise UsageError(f"cannot draw {about['env']} ({error}); {hint}") from error
+    if gif:
+        octree = Image.Quantize.FASTOCTREE  # keeps the colour of something as small as a goal
+        frames = [Image.fromarray(frame) for frames in shown for frame in frames]
+        images = [frame.resize((PIXELS, PIXELS)).quantize(64, octree) for frame in frames]
+        try:
+            images[0].save(gif, save_all=True, append_images=images[1:], duration=60, loop=0)
+        except OSError as error:
+            raise UsageError(f"cannot write {gif}: {error.strerror or error}") from error
+        print(f"{gif}: {len(seeds)} episodes, {os.path.getsize(gif) // 1024} KB")
 
 
 def episode(
