@@ -107,8 +107,11 @@ def parse(argv: list[str] | None) -> tuple[dict, argparse.Namespace]:
     if command.resume and command.play:
         fail("--resume and --play do not go together")
     for name in ("gif", "policy"):
-        if getattr(command, name) and not command.play:
+        file = getattr(command, name)
+        if file and not command.play:
             fail(f"--{name} goes with --play")
+        if file and not Path(file).parent.is_dir():
+            fail(f"--{name} {file}: there is no folder {Path(file).parent}")
     if command.gif and Path(command.gif).suffix.lower() not in ANIMATIONS:
         fail(f"--gif {command.gif}: its ending must be one of {', '.join(ANIMATIONS)}")
     if command.policy and Path(command.policy).suffix != ".npz":

@@ -178,6 +178,8 @@ BAD = [
     ("--play full --gif a.mp3", "its ending must be one of .gif"),
     ("--play full --policy a.pt", "its ending must be .npz"),
     ("--policy a.npz", "--policy goes with --play"),
+    ("--play full --policy no/a.npz", "--policy no/a.npz: there is no folder no"),
+    ("--play full --gif no/a.gif", "--gif no/a.gif: there is no folder no"),
     ("--play full/config.json", "holds no policy"),
     ("--resume typed", "--epochs must be of type int"),
     ("--resume list", "another version"),
