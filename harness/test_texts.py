@@ -77,6 +77,13 @@ def test_the_maps_code_and_tests_exist():
             assert re.search(rf"(def|class) {part}\b|^{part} =", source, re.M) or part == "py", name
 
 
+def test_the_files_have_about_as_many_lines_as_readme_says():
+    table = re.findall(r"\| \[(\w+\.py)\]\(\w+\.py\) \| (\d+) \|", (HERE / "README.md").read_text())
+    assert len(table) == 5
+    for name, lines in table:
+        assert abs(len((HERE / name).read_text().splitlines()) - int(lines)) <= 5, name
+
+
 @pytest.mark.parametrize("file", TEXTS, ids=lambda file: str(file.relative_to(HERE)))
 def test_links_lead_somewhere_and_options_exist(file):
     text = file.read_text()
