@@ -52,9 +52,8 @@ class Parts:
 
 def memory_needed(config: Config, task: Task) -> int:
     """Bytes that networks, buffers and a mini-batch of a run take when they are full, roughly."""
-    row = 4 * (
-        2 * task.obs_dim + task.goal_dim + task.action_dim + 4
-    )  # of B_h, and of a mini-batch
+    # a transition of B_h, and of a mini-batch
+    row = 4 * (2 * task.obs_dim + task.goal_dim + task.action_dim + 4)
     of_a_head = 4 * HIDDEN * (HIDDEN + 2 + task.action_dim)
     networks = 9 * config.heads * of_a_head  # two, with targets and moments, and a copy of one
     scored = settings.scored_a_sweep(config) * config.heads
