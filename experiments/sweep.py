@@ -269,8 +269,8 @@ def main(argv: Iterable[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        main()
-    except KeyboardInterrupt:
-        sys.exit("sweep.py: stopped; the same command goes on")
+    # not KeyboardInterrupt: if one passes through exec(text), as in many an import, CPython kills
+    # `python -m` with SIGINT, whatever its exit code was to be
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: sys.exit("sweep.py: stopped; the same command goes on"))
+    main()

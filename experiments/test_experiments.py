@@ -5,7 +5,6 @@ import importlib.util
 import json
 import signal
 import sys
-import time
 from dataclasses import asdict
 from types import SimpleNamespace
 
@@ -22,7 +21,7 @@ from harness.errors import UsageError
 from harness.records import COLUMNS, epochs_done, read_checkpoint
 from harness.settings import METHODS, Config
 from harness.tasks import PAPER_ENVS, examine
-from harness.testing import finish, start, without_timing
+from harness.testing import finish, start, wait_for_an_epoch, without_timing
 from her import EpisodeBuffer
 from run import train
 from vcp import value_consistency_priority
@@ -510,8 +509,7 @@ def test_a_plan_that_is_told_to_stop_loses_no_whole_epoch(name, tmp_path):
     plan.write_text(f"--env PointMassEmptyEnv-v1 --set {its}")
     process = start("--plan", plan, "--out", out, module="experiments.sweep")
     folder = folder_of(out)
-    while epochs_done(folder) < 1 and process.poll() is None:
-        time.sleep(0.05)
+    wait_for_an_epoch(process, folder)
     process.send_signal(getattr(signal, name))
     code, text, err = finish(process)
     assert code == 1 and err == "sweep.py: stopped; the same command goes on\n"
@@ -521,6 +519,16 @@ def test_a_plan_that_is_told_to_stop_loses_no_whole_epoch(name, tmp_path):
     code, text, err = finish(start("--plan", plan, "--out", out, module="experiments.sweep"))
     assert code == 0 and f"now {folder}, {done} of {done + 1} epochs" in text, err
     assert epochs_done(folder) == done + 1
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_sweep_that_is_told_to_stop_while_it_imports_ends_with_its_line(name, tmp_path):
+    (tmp_path / "slow.py").write_text("exec('import time; print(1, flush=True); time.sleep(600)')")
+    process = start("--env", "slow:Slow-v0", module="experiments.sweep", cwd=tmp_path)
+    assert process.stdout.readline() == "1\n"
+    process.send_signal(getattr(signal, name))
+    code, _, err = finish(process)
+    assert code == 1 and err == "sweep.py: stopped; the same command goes on\n"
 
 
 def test_the_hours_that_are_left(tmp_path):

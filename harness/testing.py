@@ -6,6 +6,7 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import gymnasium as gym
@@ -144,10 +145,10 @@ SMALL = {
 ARGUMENTS = [f"{settings.flag(k)}={v}" for k, v in SMALL.items()]
 
 
-def start(*arguments, program=None, module=None, limit=None):
+def start(*arguments, program=None, module=None, limit=None, cwd=None):
     """run.py (or a program's text, or a module) in a process and session of its own, which Ctrl-C
     reaches even if these tests run in the background; with a limit on the size of the files it may
-    write."""
+    write; in this folder or another."""
 
     def prepare():
         signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -163,7 +164,15 @@ def start(*arguments, program=None, module=None, limit=None):
         start_new_session=True,
         env={**os.environ, "PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"},
         preexec_fn=prepare,
+        cwd=cwd,
     )
+
+
+def wait_for_an_epoch(process, folder):
+    """Until the first is whole, its picture too: what a signal raises in an import, as that of
+    matplotlib, its C code may turn into an ImportError or lose."""
+    while not (folder / "curve.png").exists() and process.poll() is None:
+        time.sleep(0.05)
 
 
 def finish(process):
