@@ -52,13 +52,12 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     noise_shape, steps = (horizon, num_envs, its.task.action_dim), num_envs * horizon
     test_rounds = math.ceil(config.eval_episodes / num_envs)
     folder, began = Path(config.out), time.perf_counter()
-    rows = records.restore(folder, asdict(config), its.state()) if resume else []
-    began -= rows[-1]["wall_seconds"] if rows else 0
     with (
         its.envs() as envs,
-        records.held(folder, asdict(config), rows, resume),
+        records.held(folder, asdict(config), its.state(), resume) as rows,
         ThreadPoolExecutor(1) as thread,
     ):
+        began -= rows[-1]["wall_seconds"] if rows else 0
         print(its.task.made)
         for epoch in range(len(rows) + 1, config.epochs + 1):  # 2: M epochs
             train_seed, test_seed, play_rng, her_rng, draw_rng = randomness(config.seed, epoch)

@@ -153,11 +153,12 @@ def read_config(folder: Path) -> dict:
 
 
 @contextmanager
-def held(folder: Path, config: dict, rows: list[dict], resume: bool) -> Iterator[None]:
-    """The run's folder, this process's alone in the block. It is made, or with `resume` brought to
-    the state of the rows of its checkpoint; a finished run's config.json keeps the commit and
-    versions that made it. UsageError if the folder holds a run that is not resumed, if another
-    process has it, or if it cannot be written to."""
+def held(folder: Path, config: dict, parts: tuple, resume: bool) -> Iterator[list[dict]]:
+    """The run's folder, this process's alone in the block, and the rows so far. It is made, or with
+    `resume` both it and the parts are brought to the state of its checkpoint; a finished run's
+    config.json keeps the commit and versions that made it. UsageError if the folder holds a run
+    that is not resumed, if another process has it, or if it cannot be written to; and that of
+    `restore`."""
     lock = FileLock(folder / ".lock", timeout=0)  # any death of the process releases it
     try:
         _refuse_another(folder, resume)
@@ -169,10 +170,11 @@ def held(folder: Path, config: dict, rows: list[dict], resume: bool) -> Iterator
         raise UsageError(f"cannot write to {folder}: {error.strerror or error}") from error
     try:
         _refuse_another(folder, resume)  # one that was faster
+        rows = restore(folder, config, parts) if resume else []
         if len(rows) < config["epochs"]:
             write_config(folder, config)
         write_rows(folder, rows, config)
-        yield
+        yield rows
     finally:
         lock.release()
 

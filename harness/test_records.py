@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from filelock import FileLock, Timeout
 
 import run
 from harness import records
@@ -250,3 +251,16 @@ def test_two_processes_in_one_folder(tmp_path):
         assert "another process trains in" in err or "already holds a run" in err
     assert finish(first)[0] == 0 and len(read_rows(folder)) == 30
     main([f"--resume={folder}", "--epochs=31"])  # the lock is gone with its process
+
+
+def test_the_checkpoint_is_read_when_no_other_process_can_write_it(whole, tmp_path, monkeypatch):
+    folder, restore = shutil.copytree(whole, tmp_path / "run"), records.restore
+
+    def locked(*args):
+        with pytest.raises(Timeout):
+            FileLock(folder / ".lock", timeout=0).acquire()
+        return restore(*args)
+
+    monkeypatch.setattr(records, "restore", locked)
+    main([f"--resume={folder}", "--epochs=5"])
+    assert len(read_rows(folder)) == 5
