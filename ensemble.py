@@ -119,8 +119,6 @@ class EnsembleDDPG:
 
     All methods take and return NumPy arrays; actions are in [-1, 1].
     gamma: discount (the paper does not say; 1 - 1/T for episodes of T steps).
-    trunk_rate: the trunks' share of the learning rate. 1 is Algorithm 2 to the letter: the trunks
-        take K whole steps, one with each head. With 1/K these add up to one (NOTES.md).
     polyak: share of the old target kept in `update_targets` (Appendix B: 0.95).
     action_penalty: weight of mean(μ²) in the actor's loss (not in the paper; 1 in HER's code).
     """
@@ -134,7 +132,6 @@ class EnsembleDDPG:
         gamma: float,
         heads: int = 16,
         learning_rate: float = 1e-3,
-        trunk_rate: float = 1.0,
         polyak: float = 0.95,
         action_penalty: float = 1.0,
         device: str = "cpu",
@@ -158,11 +155,8 @@ class EnsembleDDPG:
 
         # One Adam for everything; it passes over heads without a gradient, those not updated. With
         # one for each head, as in the released code, the trunks die (NOTES.md, "the trunks' Adam").
-        nets = (self.actor, self.critic)
-        trunks = [p.requires_grad_() for net in nets for p in net.trunk]
-        own = [p.requires_grad_() for net in nets for p in net.parameters()[4:]]
-        rates = [{"params": trunks, "lr": learning_rate * trunk_rate}, {"params": own}]
-        self.optimizer = torch.optim.Adam(rates, learning_rate, fused=True)
+        params = [p.requires_grad_() for net in (self.actor, self.critic) for p in net.parameters()]
+        self.optimizer = torch.optim.Adam(params, learning_rate, fused=True)
 
     @torch.no_grad()
     def act(self, obs: np.ndarray, goal: np.ndarray, heads: slice = slice(None)) -> np.ndarray:
@@ -196,11 +190,13 @@ class EnsembleDDPG:
         q = critic.all_heads(state_action).squeeze(-1)  # (K, B)
         return q.var(dim=0, correction=0).cpu().numpy()
 
-    def update_head(self, k: int, batch: dict[str, np.ndarray]) -> torch.Tensor:
+    def update_head(self, k: int, batch: dict[str, np.ndarray], step: bool = True) -> torch.Tensor:
         """Algorithm 2, line 16: one DDPG step of head k, Eqs. (2) and (3), conditioned on goals.
 
         batch: obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,) and weight (B,).
         It moves head k and both trunks, no other head; both gradients are taken before either step.
+        step: False leaves the step to a later call, which then takes one for all heads since the
+        last, the trunks' by the sum of their gradients: heads at once (NOTES.md).
         No state is terminal: episodes have a fixed length. Returns critic's and actor's loss, (2,).
         """
         state = self._state(batch["obs"], batch["goal"])  # (B, O+G)
@@ -225,9 +221,10 @@ class EnsembleDDPG:
         actor_loss = -(weight * policy_q).mean()
         actor_loss = actor_loss + self.action_penalty * (weight * policy.square()).mean()
 
-        self.optimizer.zero_grad()
         (critic_loss + actor_loss).backward()  # they have no parameter in common
-        self.optimizer.step()
+        if step:
+            self.optimizer.step()
+            self.optimizer.zero_grad()
         return torch.stack([critic_loss, actor_loss]).detach()
 
     def update_targets(self) -> None:

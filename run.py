@@ -94,7 +94,8 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                             scored = thread.submit(score, original_buffer, *scoring, *relabelling)
                         for k in range(heads):  # 14: the heads in turn
                             batch = its.replay.sample(config.batch_size, draw_rng)  # 15: from B_h
-                            notes.losses.append(agent.update_head(k, batch))  # 16: 𝔸 on head k
+                            step = (k + 1) % config.heads_at_once == 0
+                            notes.losses.append(agent.update_head(k, batch, step))  # 16: 𝔸
                             notes.originals.append(1 - batch["hindsight"].mean())
                         if her_buffer:  # 17: both are done; Algorithm 1, its lines 6-7
                             her_buffer.add(*scored.result())

@@ -463,24 +463,24 @@ def test_a_head_is_trained_through_its_network_with_any_optimiser():
     assert len(net.parameters()) == 4 + 4 * 4 and not own[0]
 
 
-@pytest.mark.parametrize("trunk_rate", [1, 0.25])
-def test_updates_are_those_of_plain_ddpg(trunk_rate):
+@pytest.mark.parametrize("together", [1, 3])
+def test_updates_are_those_of_plain_ddpg(together):
     """Eqs. (2) and (3), step by step, against plain modules, plain Adam and the textbook's loss:
-    own targets, clipping, weights, gradients before steps, one Adam of the trunk for all heads and
-    its rate."""
-    agent = random_agent(heads=3, trunk_rate=trunk_rate)
+    own targets, clipping, weights, gradients before steps, one Adam of the trunk for all heads. Of
+    heads that step together the trunk's gradients are added up."""
+    agent = random_agent(heads=3)
     actors, critics = plain_ensemble(agent.actor, True), plain_ensemble(agent.critic, False)
     target_actors = plain_ensemble(agent.target_actor, True)
     target_critics = plain_ensemble(agent.target_critic, False)
-
-    def adams(nets):
-        trunk = torch.optim.Adam(nets[0].trunk.parameters(), lr=1e-3 * trunk_rate)
-        return [(trunk, torch.optim.Adam(net.head.parameters(), lr=1e-3)) for net in nets]
-
+    trunks = [torch.optim.Adam(nets[0].trunk.parameters()) for nets in (actors, critics)]
+    heads = [
+        [torch.optim.Adam(nets[k].head.parameters()) for nets in (actors, critics)]
+        for k in range(3)
+    ]
     assert all(net.trunk is nets[0].trunk for nets in (actors, critics) for net in nets)
-    optimizers = [a + c for a, c in zip(adams(actors), adams(critics), strict=True)]
-    for step, k in enumerate([1, 2, 1, 0, 1]):
-        batch = random_batch(seed=step)
+    moved = set()
+    for i, k in enumerate([1, 2, 1, 0, 1] if together == 1 else [0, 1, 2, 0, 1, 2]):
+        batch = random_batch(seed=i)
         state, next_state, action, reward, weight = as_tensors(agent, batch)
         with torch.no_grad():
             y = reward + 0.9 * target_critics[k](next_state, target_actors[k](next_state))
@@ -488,16 +488,20 @@ def test_updates_are_those_of_plain_ddpg(trunk_rate):
         critic_loss = (weight * (critics[k](state, action) - y) ** 2).mean()
         pi = actors[k](state)
         actor_loss = -(weight * critics[k](state, pi)).mean() + (weight * pi**2).mean()
-        for optimizer in optimizers[k]:
-            optimizer.zero_grad()
-        critic_loss.backward(retain_graph=True)
-        critic_grads = [p.grad.clone() for p in critics[k].parameters()]
-        actor_loss.backward()
-        for p, g in zip(critics[k].parameters(), critic_grads, strict=True):
-            p.grad = g  # without what the actor's loss left there
-        for optimizer in optimizers[k]:
-            optimizer.step()
-        losses = agent.update_head(k, batch)
+        for loss, net in ((critic_loss, critics[k]), (actor_loss, actors[k])):
+            params = [*net.parameters()]
+            for p, g in zip(
+                params, torch.autograd.grad(loss, params, retain_graph=True), strict=True
+            ):
+                p.grad = g if p.grad is None else p.grad + g
+        moved.add(k)
+        step = (i + 1) % together == 0
+        if step:
+            for optimizer in (*trunks, *(adam for k in moved for adam in heads[k])):
+                optimizer.step()
+                optimizer.zero_grad()
+            moved = set()
+        losses = agent.update_head(k, batch, step)
         torch.testing.assert_close(
             losses, torch.stack([critic_loss, actor_loss]).detach(), rtol=1e-4, atol=1e-5
         )
@@ -771,8 +775,13 @@ def test_reacher_reports_the_fingertips_velocity():
 # ---------------------------------------------------------------------------------- run
 
 
-@pytest.mark.parametrize(("acting_head", "collecting"), [("all", (4, 4, 2)), ("one", (1, 16, 2))])
-def test_train_does_what_algorithm_2_says(acting_head, collecting, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("acting_head", "collecting", "together", "steps"),
+    [("all", (4, 4, 2), 1, {0, 1, 2, 3}), ("one", (1, 16, 2), 2, {1, 3})],
+)
+def test_train_does_what_algorithm_2_says(
+    acting_head, collecting, together, steps, tmp_path, monkeypatch
+):
     """The calls, in order: B_h filled with as much as B_o holds; then Algorithm 1 beside the heads,
     which are updated in turn, each with a mini-batch of its own; the targets once a cycle; the
     normaliser fed with every step."""
@@ -783,10 +792,10 @@ def test_train_does_what_algorithm_2_says(acting_head, collecting, tmp_path, mon
             super().__init__(*args, **kwargs)
             agents.append(self)
 
-        def update_head(self, k, batch):
+        def update_head(self, k, batch, step):
             calls.append((k, batch["obs"].tobytes()))
-            assert len(batch["obs"]) == 16
-            return super().update_head(k, batch)
+            assert len(batch["obs"]) == 16 and step is (k in steps)
+            return super().update_head(k, batch, step)
 
         def update_targets(self):
             calls.append("targets")
@@ -834,6 +843,7 @@ def test_train_does_what_algorithm_2_says(acting_head, collecting, tmp_path, mon
         "num_workers": 1,
     }
     settings |= {"acting_head": acting_head, "scored_per_drawn": 2.0, "her_buffer_capacity": 1700}
+    settings |= {"heads_at_once": together}
     (row,) = train(Config(**settings, env="PointMassEmptyEnv-v1", out=str(tmp_path / "run")))
     names = [call if isinstance(call, str) else call[0] for call in calls]
     sweep = ["frozen", 0, 1, 2, 3, "stored"]  # B_h stands still meanwhile

@@ -536,9 +536,9 @@ def test_a_resumed_run_of_every_method_equals_an_uninterrupted_one(method, tmp_p
 def test_the_heads_get_mini_batches_of_their_own(tmp_path, monkeypatch):
     batches = []
 
-    def spy(self, k, batch):
+    def spy(self, k, batch, step):
         batches.append((k, batch["obs"].tobytes()))
-        return update(self, k, batch)
+        return update(self, k, batch, step)
 
     update = EnsembleDDPG.update_head
     monkeypatch.setattr(EnsembleDDPG, "update_head", spy)

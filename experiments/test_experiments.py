@@ -65,7 +65,7 @@ def results(tmp_path):
         make_run(tmp_path / "push" / method, env="FetchPush-v1", method=method, heads=1)
     make_run(tmp_path / "small", env="FetchReach-v1", updates=2)
     make_run(tmp_path / "just-begun", epochs=0, env="FetchReach-v1")
-    make_run(tmp_path / "stopped", epochs=2, of=6, env="Reacher-v2", trunk_rate=0.5)
+    make_run(tmp_path / "stopped", epochs=2, of=6, env="Reacher-v2", heads_at_once=2)
     return tmp_path
 
 
@@ -133,8 +133,8 @@ def test_ones_own_runs_are_drawn(tmp_path, monkeypatch, capsys):
         ({"her_buffer_capacity": 1280}, "VCP, her_buffer_capacity 1280"),
         ({"action_penalty": 0.1, "noise": 0.1}, "VCP, noise 0.1, action_penalty 0.1"),
         ({"env": "FetchPush-v1"}, "VCP"),
-        ({"env": "FetchPush-v1", "trunk_rate": 1.0}, "VCP, trunk_rate 1.0"),
-        ({"trunk_rate": 0.0625}, "VCP, trunk_rate 0.0625"),
+        ({"env": "FetchPush-v1", "heads_at_once": 1}, "VCP, heads_at_once 1"),
+        ({"heads_at_once": 16}, "VCP, heads_at_once 16"),
     ],
 )
 def test_the_label_names_what_is_not_the_default(given, label):
@@ -280,7 +280,13 @@ def test_dead_units(tmp_path, capsys):
 def test_the_trunk_outlives_the_first_cycle(tmp_path, capsys):
     """With an Adam for each head, and so K moments of the trunk, four fifths of the actors'
     trunk are dead after 40 updates (NOTES.md, "the trunks' Adam")."""
-    settings = {"env": "FetchPush-v1", "epochs": 1, "cycles": 1, "batch_size": 64, "trunk_rate": 1}
+    settings = {
+        "env": "FetchPush-v1",
+        "epochs": 1,
+        "cycles": 1,
+        "batch_size": 64,
+        "heads_at_once": 1,
+    }
     train(Config(**settings, eval_episodes=16, num_workers=1, out=str(tmp_path)))
     inspect_run.main(["dead", str(tmp_path)])
     line = capsys.readouterr().out.splitlines()[-1].split(" | ")
@@ -314,7 +320,7 @@ def test_the_summary(results):
     assert vcp[2:5] == ["2", "6", "5"]
     assert vcp[5] == "0.670 (0.667 0.673)" and vcp[6] == "0.822 (0.760 0.884)"
     assert vcp[7] == "1.50 |"  # minutes an epoch
-    assert not [r for r in rows if "trunk_rate" in str(r)]  # stopped
+    assert not [r for r in rows if "heads_at_once" in str(r)]  # stopped
     # .35 and .36 twice, beside .667 and .673 twice; the schedule that only VCP has does not count
     (total,) = [r for r in rows if r[0] == "| VCP, 4 heads" and len(r) == 4]
     assert total[1] == "FetchReach-v1, Reacher-v2"

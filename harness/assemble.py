@@ -94,7 +94,6 @@ def make_agent(config: Config, task: Task) -> EnsembleDDPG:
         heads=config.heads,
         gamma=1 - 1 / task.horizon,
         learning_rate=config.learning_rate,
-        trunk_rate=config.trunk_rate,
         polyak=config.polyak,
         action_penalty=config.action_penalty,
         device=config.device,

@@ -47,7 +47,7 @@ COLUMNS = [
 TIMING_COLUMNS = {name for name in COLUMNS if name.endswith("_seconds")}
 PACKAGES = ("numpy", "torch", "gymnasium", "gymnasium-robotics", "mujoco")
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
-FORMAT = 3  # of checkpoints; others are refused
+FORMAT = 4  # of checkpoints; others are refused
 MAY_CHANGE = ("epochs", "out", "device", "num_workers", "tensorboard")  # when a run is resumed
 
 tqdm.monitor_interval = 0  # its watching thread would outlive a run

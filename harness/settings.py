@@ -57,8 +57,8 @@ class Config:
         0.8, SCHEDULE, "share of transitions with a hindsight goal, k/(1+k)", least=0, most=1
     )
     learning_rate: float = setting(1e-3, SCHEDULE, "Adam's, of actors and critics", above=0)
-    trunk_rate: float | None = setting(
-        None, SCHEDULE, "the shared trunks' share of it (default: 1, or 1/K by updates)", above=0
+    heads_at_once: int | None = setting(
+        None, SCHEDULE, "heads that step together (default: 1, or all, by updates)", least=1
     )
     polyak: float = setting(0.95, SCHEDULE, "what a target network keeps, a cycle", least=0, most=1)
     noise: float = setting(0.2, SCHEDULE, "standard deviation of the exploration noise", least=0)
@@ -117,11 +117,11 @@ def paper_schedule(env: str, method: str = "vcp") -> dict[str, int]:
     return {"cycles": 50, "updates": 40, "batch_size": 256}
 
 
-def trunk_share(updates: int, heads: int) -> float:
-    """The trunks' share of the learning rate where none is given (not in the paper). With few
-    updates a cycle, 1, Algorithm 2 to the letter: the trunks take K whole steps, one with each
-    head. With many these K steps add up to one (NOTES.md, "The trunk's step")."""
-    return 1.0 if updates <= 5 else 1 / heads
+def heads_at_once(updates: int, heads: int) -> int:
+    """How many heads take a step together where it is not given (not in the paper). With few
+    updates a cycle one, Algorithm 2 to the letter: the trunks take K steps, one with each head.
+    With many, all, so that the trunks take one (NOTES.md, "Heads at once")."""
+    return 1 if updates <= 5 else heads
 
 
 def drawn_a_sweep(config: Config) -> int:
@@ -159,8 +159,10 @@ def complete(config: Config) -> Config:
         if scored > capacity:
             raise UsageError(f"{scored} transitions are scored at once, and B_h holds {capacity}")
         config.her_buffer_capacity = capacity
-    if config.trunk_rate is None:
-        config.trunk_rate = trunk_share(config.updates, config.heads)
+    if config.heads_at_once is None:
+        config.heads_at_once = heads_at_once(config.updates, config.heads)
+    if config.heads % config.heads_at_once:
+        raise UsageError(f"--heads-at-once must divide the {config.heads} heads")
     if config.device == "auto":
         config.device = "cuda" if torch.cuda.is_available() else "cpu"
     if config.device == "cuda" and not torch.cuda.is_available():
@@ -198,9 +200,9 @@ def differences(config: Config) -> dict[str, Any]:
     for the seed and what may change when it is resumed."""
     default = complete(Config(env=config.env, method=config.method, out=""))
     # These two follow from others where they are not given.
-    follows = complete(replace(config, trunk_rate=None, her_buffer_capacity=None, out=""))
-    default.trunk_rate, default.her_buffer_capacity = (
-        follows.trunk_rate,
+    follows = complete(replace(config, heads_at_once=None, her_buffer_capacity=None, out=""))
+    default.heads_at_once, default.her_buffer_capacity = (
+        follows.heads_at_once,
         follows.her_buffer_capacity,
     )
     names = [f.name for f in fields(Config) if f.name not in ("seed", *MAY_CHANGE)]

@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from harness import settings
-from harness.assemble import make_agent
 from harness.errors import UsageError
 from harness.settings import Config
-from harness.tasks import PAPER_ENVS, examine
+from harness.tasks import PAPER_ENVS
 
 
 def test_the_schedule_is_appendix_b():
@@ -25,21 +24,20 @@ def test_the_schedule_is_appendix_b():
 
 
 @pytest.mark.parametrize(
-    "given, rate",
+    "given, together",
     [
         ({}, 1),
-        ({"env": "FetchPush-v1"}, 1 / 16),
+        ({"env": "FetchPush-v1"}, 16),
         ({"env": "FetchPush-v1", "updates": 5}, 1),
-        ({"env": "HandReach-v0", "heads": 4, "method": "dtgsh"}, 1 / 4),
+        ({"env": "HandReach-v0", "heads": 4, "method": "dtgsh"}, 4),
         ({"env": "FetchPush-v1", "heads": 1, "method": "her"}, 1),
-        ({"env": "FetchPush-v1", "trunk_rate": 0.5}, 0.5),
+        ({"env": "FetchPush-v1", "heads_at_once": 8}, 8),
     ],
 )
-def test_with_many_updates_the_trunks_steps_add_up_to_one(given, rate):
-    config = settings.complete(Config(**given))
-    assert config.trunk_rate == rate
-    groups = make_agent(config, examine(config.env)).optimizer.param_groups
-    assert [group["lr"] for group in groups] == [1e-3 * rate, 1e-3]
+def test_with_many_updates_the_heads_step_together(given, together):
+    assert settings.complete(Config(**given)).heads_at_once == together
+    with pytest.raises(UsageError, match="--heads-at-once must divide"):
+        settings.complete(Config(**{**given, "heads_at_once": 5}))
 
 
 def test_what_is_scored_fits_into_the_buffer():

@@ -5,6 +5,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+import torch
 
 import run
 from baselines.cher import CHER
@@ -30,7 +31,7 @@ SETTINGS = {  # none of them a default
     "buffer_size": 700,
     "relabel_ratio": 0.6,
     "learning_rate": 2e-3,
-    "trunk_rate": 0.25,
+    "heads_at_once": 2,
     "polyak": 0.9,
     "noise": 0.11,
     "random_actions": 0.22,
@@ -51,7 +52,7 @@ SETTINGS = {  # none of them a default
 def spied(tmp_path, monkeypatch):
     """A run with these settings, and what its parts were given."""
     seen = {name: [] for name in ("agent", "b_h", "ratio", "exploring", "acted", "normalised")}
-    seen |= {name: [] for name in ("success", "losses", "batches", "values")}
+    seen |= {name: [] for name in ("success", "losses", "steps", "batches", "values")}
 
     def spy(owner, name, key, take):
         original = getattr(owner, name)
@@ -71,6 +72,7 @@ def spied(tmp_path, monkeypatch):
     spy(EnsembleDDPG, "act", "acted", lambda a, k, result: (a[1].shape, result))
     spy(EnsembleDDPG, "value", "values", lambda a, k, result: result)
     spy(EnsembleDDPG, "update_head", "losses", lambda a, k, result: result.numpy())
+    spy(torch.optim.Adam, "step", "steps", lambda a, k, result: None)
     spy(HERBuffer, "sample", "batches", lambda a, k, result: result)
     scored = []
     score = run.score
@@ -83,7 +85,7 @@ def test_each_setting_arrives(spied):
     seen, scored, _ = spied
     (agent,), ((b_h, _),) = seen["agent"], seen["b_h"]
     assert agent["heads"] == 4 and agent["gamma"] == 0.95  # 1 - 1/20
-    assert agent["learning_rate"] == 2e-3 and agent["trunk_rate"] == 0.25
+    assert agent["learning_rate"] == 2e-3
     assert agent["polyak"] == 0.9 and agent["action_penalty"] == 0.33
     assert agent["seed"] == 5 and agent["device"] == "cpu"
     assert b_h == {
@@ -97,7 +99,7 @@ def test_each_setting_arrives(spied):
     # T, environments, actions; the warm-up is all random
     assert seen["exploring"] == [((20, 16, 2), 0.11, share) for share in (1, 0.22, 0.22, 0.22)]
     assert {len(batch["obs"]) for batch in seen["batches"]} == {24}
-    assert len(seen["losses"]) == 3 * 2 * 4
+    assert len(seen["losses"]) == 3 * 2 * 4 and len(seen["steps"]) == 3 * 2 * 2
     # 4 collections by one head in 16 environments, 3 rounds of 16 test episodes by all heads
     shapes = [shape for shape, _ in seen["acted"]]
     assert shapes == 4 * 20 * [(1, 16, 2)] + 3 * 20 * [(4, 4, 2)]
