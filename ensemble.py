@@ -196,7 +196,7 @@ class EnsembleDDPG:
         batch: obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,) and weight (B,).
         It moves head k and both trunks, no other head; both gradients are taken before either step.
         step: False leaves the step to a later call, which then takes one for all heads since the
-        last, the trunks' by the sum of their gradients: heads at once (NOTES.md).
+        last, the trunks' by the sum of their gradients (NOTES.md, "Heads in turn or at once").
         No state is terminal: episodes have a fixed length. Returns critic's and actor's loss, (2,).
         """
         state = self._state(batch["obs"], batch["goal"])  # (B, O+G)

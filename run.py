@@ -92,8 +92,9 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                         if her_buffer:  # 13: in another thread, Algorithm 1, its lines 3-5
                             scoring = (agent.frozen_q_variance(), scored_a_sweep(config))
                             scored = thread.submit(score, original_buffer, *scoring, *relabelling)
-                        for k in range(heads):  # 14: the heads in turn
+                        for k in range(heads):  # 14: for each head
                             batch = its.replay.sample(config.batch_size, draw_rng)  # 15: from B_h
+                            # + NOTES.md: of heads_at_once heads the last one steps, for all
                             step = (k + 1) % config.heads_at_once == 0
                             notes.losses.append(agent.update_head(k, batch, step))  # 16: 𝔸
                             notes.originals.append(1 - batch["hindsight"].mean())

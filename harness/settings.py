@@ -120,7 +120,7 @@ def paper_schedule(env: str, method: str = "vcp") -> dict[str, int]:
 def heads_at_once(updates: int, heads: int) -> int:
     """How many heads take a step together where it is not given (not in the paper). With few
     updates a cycle one, Algorithm 2 to the letter: the trunks take K steps, one with each head.
-    With many, all, so that the trunks take one (NOTES.md, "Heads at once")."""
+    With many, all, so that the trunks take one (NOTES.md, "Heads in turn or at once")."""
     return 1 if updates <= 5 else heads
 
 
