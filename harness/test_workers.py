@@ -71,6 +71,17 @@ def test_no_worker_waits_for_another():
     assert order[:20].count(2) > 15
 
 
+def test_a_process_ends_though_a_thread_has_read_half_of_its_answer():
+    with pytest.raises(ZeroDivisionError), ParallelEnvs("PointMassEmptyEnv-v1", 4, 2) as envs:
+        envs.reset(0)
+        vector = envs.workers[0]._env
+        (process,), (pipe,) = vector.processes, vector.parent_pipes
+        vector.step_async(np.zeros((1, 2, 2)))
+        assert len(os.read(pipe.fileno(), 4)) == 4  # the answer's length
+        raise ZeroDivisionError
+    assert not process.is_alive()
+
+
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinities on this system")
 def test_workers_have_a_core_each_and_the_main_process_keeps_all():
     cores, ctrl_c = os.sched_getaffinity(0), signal.getsignal(signal.SIGINT)

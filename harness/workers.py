@@ -135,8 +135,16 @@ class Worker:
 
     def close(self, now: bool) -> None:
         """now: without waiting for a step that may be under way."""
+        if now and self._processes():
+            # gymnasium would first read the step's answer, and the thread that waits for it has
+            # perhaps read half of it
+            for process in self._processes():
+                process.terminate()
+                process.join()
+            self._env.closed = True
+            return
         try:
-            self._env.close(**({"terminate": now} if self._processes() else {}))
+            self._env.close()
         except (EOFError, ConnectionError):  # the process is dead, so there is nothing to close
             self._env.closed = True
 
