@@ -166,7 +166,9 @@ def curves(runs: list[Run], title: str, smooth: float) -> Figure:
             draw_line(ax, seeds, names.index(name), name, smooth)
         few, many = min(map(len, methods.values())), max(map(len, methods.values()))
         seeds = f"{few}" if few == many else f"{few} to {many}"
-        ax.set_title(f"{env}, {seeds} seed{'s' * (many > 1)}", fontsize=10)
+        env, _, its_schedule = env.partition("\n")
+        panel = f"{env}, {seeds} seed{'s' * (many > 1)}\n{its_schedule}"
+        ax.set_title(panel.strip(), fontsize=10)
         ax.set(xlabel="epoch", ylim=(-0.03, 1.03))
         ax.xaxis.get_major_locator().set_params(integer=True)
         ax.grid(alpha=0.3)
@@ -252,7 +254,7 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
         shared = [env for env in by_env if env in means["VCP"]]
         if name != "VCP" and len(shared) > 1:
             both = (total([means[n][env] for env in shared]) for n in (name, "VCP"))
-            totals.append(f"| {name} | {', '.join(shared)} | {' | '.join(both)} |")
+            totals.append(f"| {name} | {'; '.join(shared)} | {' | '.join(both)} |")
     columns = ("seeds", "epochs", "first at .95", "mean", f"last {last}", "minutes an epoch")
     head = [f"| environment | method | {' | '.join(columns)} |", "|---" * (2 + len(columns)) + "|"]
     tables = [*head, *lines]

@@ -323,7 +323,7 @@ def test_the_summary(results):
     assert not [r for r in rows if "heads_at_once" in str(r)]  # stopped
     # .35 and .36 twice, beside .667 and .673 twice; the schedule that only VCP has does not count
     (total,) = [r for r in rows if r[0] == "| VCP, 4 heads" and len(r) == 4]
-    assert total[1] == "FetchReach-v1, Reacher-v2"
+    assert total[1] == "FetchReach-v1; Reacher-v2"
     assert total[2] == "0.355" and total[3] == "0.670 |"
     assert not [r for r in rows if r[0] == "| VCP"]
 
