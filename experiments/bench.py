@@ -92,7 +92,7 @@ def bench_update(repeats: int, heads: int = 16) -> None:
     print(
         "\n1. The ensemble update: 16 heads in sequence, beside its matrix products alone (floor):"
     )
-    print("   as PyTorch makes them, and as a run has them made (workers.fast_products)")
+    print("   as PyTorch makes them, and as a run has them made (numerics.fast_products)")
     print(
         f"{'sizes of':14} {'batch':>5} {'update ms':>20} {'floor ms':>20} {'ratio':>6}"
         f" {'fast floor ms':>20} {'ratio':>6}"
