@@ -208,12 +208,12 @@ def interquartile_mean(x: np.ndarray) -> float:
 
 
 def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
-    """Two tables. For each environment and method: the first epoch with a success of 0.95 and the
-    minutes an epoch took (medians over seeds), the mean success over the epochs that all runs of
-    the environment have, and over the last ones of each run, as `said`. For each method
-    that shares more than one environment with VCP: the interquartile mean over all of the second
-    for both, on the shared ones, each of the same weight, with a bootstrap that draws seeds within
-    each. Runs that were stopped before their last epoch are left out."""
+    """Two tables. For each environment and method, over the epochs that all runs of the environment
+    have: the first with a success of 0.95 and the minutes that one took (medians over seeds), the
+    mean success, and that of the last ones, as `said`. For each method that shares more than one
+    environment with VCP: the interquartile mean of all seeds' mean successes for both, on the
+    shared ones, each of the same weight, with a bootstrap that draws seeds within each. Runs that
+    were stopped before their last epoch are left out."""
     success = defaultdict(lambda: defaultdict(list))
     minutes = defaultdict(list)
     for run in runs:
@@ -227,9 +227,10 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
     for env, methods in sorted(success.items()):
         epochs = min(len(curve) for seeds in methods.values() for curve in seeds)
         for name, seeds in sorted(methods.items()):
+            seeds = [curve[:epochs] for curve in seeds]
             firsts = [np.flatnonzero(curve >= 0.95)[:1] + 1 for curve in seeds]
             first = np.median([f[0] if len(f) else np.inf for f in firsts])
-            means[name][env] = np.array([curve[:epochs].mean() for curve in seeds])
+            means[name][env] = np.array([curve.mean() for curve in seeds])
             end = np.array([curve[-last:].mean() for curve in seeds])
             columns = [f"{len(seeds)}", f"{epochs}", "never" if np.isinf(first) else f"{first:g}"]
             columns += [said(means[name][env]), said(end)]
