@@ -57,9 +57,13 @@ class MultiHeadMLP:
         """The trunk's four tensors, then four of each head."""
         return [*self.trunk, *(p for own in self.own for p in own)]
 
-    def __call__(self, k: int, x: torch.Tensor, frozen: bool = False) -> torch.Tensor:
-        """Head k's network, (B, I) -> (B, J). frozen: without gradients for its parameters."""
-        params = [*self.trunk, *self.own[k]]
+    def __call__(self, k: int | slice, x: torch.Tensor, frozen: bool = False) -> torch.Tensor:
+        """Head k's network, (B, I) -> (B, J), or those of some heads, each for rows of its own,
+        (n, B, I) -> (n, B, J). frozen: without gradients for their parameters."""
+        own = self.own[k]
+        if isinstance(k, slice):
+            own = [torch.stack(p) for p in zip(*own, strict=True)]
+        params = [*self.trunk, *own]
         return self._forward([p.detach() for p in params] if frozen else params, x)
 
     @torch.no_grad()
@@ -190,7 +194,9 @@ class EnsembleDDPG:
         q = critic.all_heads(state_action).squeeze(-1)  # (K, B)
         return q.var(dim=0, correction=0).cpu().numpy()
 
-    def update_head(self, k: int, batch: dict[str, np.ndarray], step: bool = True) -> torch.Tensor:
+    def update_head(
+        self, k: int | slice, batch: dict[str, np.ndarray], step: bool = True
+    ) -> torch.Tensor:
         """Algorithm 2, line 16: one DDPG step of head k, Eqs. (2) and (3), conditioned on goals.
 
         batch: obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,) and weight (B,).
@@ -199,33 +205,37 @@ class EnsembleDDPG:
         last, the trunks' by the sum of their gradients (NOTES.md, "Heads in turn or at once").
         No state is terminal: episodes have a fixed length. Returns critic's and actor's loss, (2,).
         """
+        losses = self._losses(k, batch)
+        losses.sum().backward()  # the two networks have no parameter in common
+        if step:
+            self.optimizer.step()
+            self.optimizer.zero_grad()
+        return losses.detach()
+
+    def _losses(self, k: int | slice, batch: dict[str, np.ndarray]) -> torch.Tensor:
+        """Eqs. (2) and (3) of head k, (2,), or of some heads, from arrays (n, B, ...): (2, n)."""
         state = self._state(batch["obs"], batch["goal"])  # (B, O+G)
         next_state = self._state(batch["next_obs"], batch["goal"])
         action = self._tensor(batch["action"])
-        reward = self._tensor(batch["reward"])[:, None]  # (B, 1)
-        weight = self._tensor(batch["weight"])[:, None]
+        reward = self._tensor(batch["reward"])[..., None]  # (B, 1)
+        weight = self._tensor(batch["weight"])[..., None]
 
         with torch.no_grad():  # y = r + γ Q̄_k(s', μ̄_k(s', g), g), head k's own targets
             next_action = self.target_actor(k, next_state)
-            next_q = self.target_critic(k, torch.cat([next_state, next_action], 1))
+            next_q = self.target_critic(k, torch.cat([next_state, next_action], -1))
             # Rewards are -1 or 0, so every return lies in [-1/(1-γ), 0] (not in the paper).
             target = (reward + self.gamma * next_q).clamp(-1 / (1 - self.gamma), 0)
 
         # Eq. (2): L(φ_k) = E[w (Q_k(s, a, g) - y)²]
-        q = self.critic(k, torch.cat([state, action], 1))
-        critic_loss = (weight * (q - target).square()).mean()
+        q = self.critic(k, torch.cat([state, action], -1))
+        critic_loss = (weight * (q - target).square()).mean((-2, -1))
 
         # Eq. (3): maximise E[w Q_k(s, μ_k(s, g), g)] over θ_k, with a penalty on large actions
         policy = self.actor(k, state)
-        policy_q = self.critic(k, torch.cat([state, policy], 1), frozen=True)
-        actor_loss = -(weight * policy_q).mean()
-        actor_loss = actor_loss + self.action_penalty * (weight * policy.square()).mean()
-
-        (critic_loss + actor_loss).backward()  # they have no parameter in common
-        if step:
-            self.optimizer.step()
-            self.optimizer.zero_grad()
-        return torch.stack([critic_loss, actor_loss]).detach()
+        policy_q = self.critic(k, torch.cat([state, policy], -1), frozen=True)
+        actor_loss = -(weight * policy_q).mean((-2, -1))
+        actor_loss = actor_loss + self.action_penalty * (weight * policy.square()).mean((-2, -1))
+        return torch.stack([critic_loss, actor_loss])
 
     def update_targets(self) -> None:
         """θ̄ <- polyak·θ̄ + (1 - polyak)·θ, once a cycle FOR EACH HEAD's target network.

@@ -4,6 +4,7 @@ import math
 import os
 import sys
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ from baselines.her import HERReplay
 from ensemble import HIDDEN, EnsembleDDPG
 from harness import records, settings
 from harness.errors import UsageError
+from harness.gpu import EnsembleOnGPU, HERBufferOnGPU
 from harness.settings import Config
 from harness.tasks import Task, examine, make_env
 from harness.workers import ParallelEnvs, whole_heads
@@ -87,7 +89,8 @@ def assemble(config: Config) -> Parts:
 
 def make_agent(config: Config, task: Task) -> EnsembleDDPG:
     """The off-policy algorithm 𝔸, with the networks' sizes for the task."""
-    return EnsembleDDPG(
+    ensemble = EnsembleOnGPU if config.device == "cuda" else EnsembleDDPG
+    return ensemble(
         obs_dim=task.obs_dim,
         goal_dim=task.goal_dim,
         action_dim=task.action_dim,
@@ -106,7 +109,10 @@ def make_replay(
 ) -> HERBuffer | HERReplay:
     """What Algorithm 2, line 15, draws from: B_h, or the replay of another method."""
     if config.method == "vcp":
-        return HERBuffer(
+        b_h = HERBuffer
+        if config.device == "cuda":
+            b_h = partial(HERBufferOnGPU, at_once=config.heads, device=config.device)
+        return b_h(
             capacity=config.her_buffer_capacity,
             temperature=config.temperature,
             priority=config.priority,
@@ -126,9 +132,9 @@ def make_replay(
 
 
 def restored(folder: Path) -> tuple[Parts, list[dict]]:
-    """The parts of the run in `folder` after its last whole epoch, and its rows. A run from a GPU
-    can be restored without one. UsageError if there is none."""
-    config = replace(settings.load(folder), device="auto", tensorboard=False)
+    """The parts of the run in `folder` after its last whole epoch, and its rows, on the CPU, also
+    of a run from a GPU. UsageError if there is none."""
+    config = replace(settings.load(folder), device="cpu", tensorboard=False)
     parts = assemble(settings.complete(config))
     rows = records.restore(folder, asdict(parts.config), parts.state())
     if not rows:

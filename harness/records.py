@@ -92,7 +92,7 @@ class Notes:
             "critic_loss": critic_loss,
             "actor_loss": actor_loss,
             **variance_by_kind(agent, replay),
-            "batch_original_fraction": float(np.mean(self.originals)),
+            "batch_original_fraction": float(sum(self.originals) / len(self.originals)),
             "her_buffer_size": replay.size,
             **{f"{name}_seconds": value for name, value in self.seconds.items()},
         }
@@ -111,7 +111,7 @@ def variance_by_kind(agent, replay, most: int = 4096) -> dict[str, float]:
     transitions of B_h or, without VCP, of what was drawn last; from about `most` of them, evenly
     spread."""
     every = slice(None, replay.size, max(1, replay.size // most))
-    rows = {name: x[every] for name, x in replay.data.items()}
+    rows = {name: torch.as_tensor(x[every]).cpu().numpy() for name, x in replay.data.items()}
     variance = agent.q_variance(rows["obs"], rows["action"], rows["goal"])
     kinds = {"hindsight": rows["hindsight"], "original": ~rows["hindsight"]}
     return {

@@ -1,0 +1,169 @@
+"""What a GPU needs beside the code of ensemble.py and vcp.py: the same numbers, but for rounding.
+
+A GPU is fast at large calls, and slow to ask. So B_h lies on it; heads that step together are
+trained in one pass, whose few hundred calls are captured once, as a CUDA graph, and then asked for
+as one; and acting, which is many small calls, stays on the CPU. The two classes stand for those
+that they are made from, and are called in the same way; `assemble` takes them for `--device cuda`.
+"""
+
+import threading
+
+import numpy as np
+import torch
+
+import vcp
+from ensemble import EnsembleDDPG
+from her import Batch
+
+WARM_UP = 3  # passes before one is captured, as many as in PyTorch's documentation of CUDA graphs
+
+
+def priorities(variance: torch.Tensor, temperature: float, eps: float = 1e-6) -> torch.Tensor:
+    """`vcp.value_consistency_priority` of a float64 tensor. It does not look for NaN, since that
+    is to wait for the GPU: a NaN gets into the losses, which are looked at after each epoch."""
+    consistency = variance.max() - variance + eps
+    priority = (consistency / consistency.max()) ** temperature
+    return priority / priority.sum()
+
+
+PRIORITIES = {
+    "consistency": priorities,
+    "variance": lambda variance, temperature: priorities(-variance, temperature),
+    "uniform": lambda variance, temperature: torch.full_like(variance, 1 / len(variance)),
+}
+IMPORTANCE = {**vcp.IMPORTANCE, "none": torch.ones_like}
+
+
+class HERBufferOnGPU(vcp.HERBuffer):
+    """B_h as tensors on `device`. It draws `at_once` mini-batches at a time, so many as are asked
+    for between two calls of `update_priorities`; they are those that `vcp.HERBuffer` draws."""
+
+    def __init__(
+        self,
+        capacity: int,
+        temperature: float,
+        priority="consistency",
+        importance="paper",
+        *,
+        at_once: int,
+        device: str,
+    ):
+        super().__init__(capacity, temperature, priority, importance)
+        self._priority, self._importance = PRIORITIES[priority], IMPORTANCE[importance]
+        self.at_once, self.device = at_once, device
+        self._drawn: list[Batch] = []
+
+    def add(self, batch: Batch, variance) -> None:
+        rows = {**batch, "variance": variance}
+        rows = {name: torch.as_tensor(x, device=self.device) for name, x in rows.items()}
+        new = len(rows["variance"])
+        if not self.data:
+            self.data = {
+                name: x.new_empty((self.capacity, *x.shape[1:])) for name, x in rows.items()
+            }
+        slots = (self._next + torch.arange(new, device=self.device)) % self.capacity
+        for name, x in rows.items():
+            self.data[name][slots] = x
+        self._next = (self._next + new) % self.capacity
+        self.size = min(self.size + new, self.capacity)
+
+    def update_priorities(self) -> None:
+        variance = self.data["variance"][: self.size].double()
+        self.probabilities = self._priority(variance, self.temperature)
+        cumulative = self.probabilities.cumsum(0)
+        self._cumulative = cumulative / cumulative[-1]
+        self._drawn = []
+
+    def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
+        """As `vcp.HERBuffer.sample`, as tensors; "hindsight" is 0 or 1."""
+        if not self._drawn:
+            u = torch.as_tensor(rng.random((self.at_once, batch_size)), device=self.device)
+            i = torch.searchsorted(self._cumulative, u, right=True)  # (at_once, B)
+            batch = {name: x[i] for name, x in self.data.items()}
+            weight = self._importance(self.probabilities[i])
+            batch["weight"] = (weight / weight.mean(-1, keepdim=True)).float()
+            batch["hindsight"] = batch["hindsight"].float()
+            self._drawn = [{n: x[j] for n, x in batch.items()} for j in range(self.at_once)]
+        return self._drawn.pop(0)
+
+    def state_dict(self) -> dict:
+        rows = {name: x[: self.size].cpu() for name, x in self.data.items()}
+        return {"rows": rows, "next": self._next}
+
+
+class EnsembleOnGPU(EnsembleDDPG):
+    """`EnsembleDDPG` on a GPU; where not all heads step together, they are trained one by one."""
+
+    def __init__(self, *sizes, **settings):
+        super().__init__(*sizes, **settings)
+        self._player = EnsembleDDPG(*sizes, **{**settings, "device": "cpu"})
+        self._lock = threading.Lock()
+        self._waiting: list[tuple[int, Batch]] = []  # heads and mini-batches without a step so far
+        self._returned = self._batch = None
+        self._begin()
+
+    def _begin(self) -> None:
+        """What is captured or copied is not any more that of the networks or the optimiser."""
+        self._steps, self._followed = 0, None
+        self._graph = None
+        self.optimizer.param_groups[0]["capturable"] = self.device.type == "cuda"
+
+    def load_state_dict(self, state: dict) -> None:
+        super().load_state_dict(state)
+        self._begin()
+
+    @torch.no_grad()
+    def act(self, obs: np.ndarray, goal: np.ndarray, heads: slice = slice(None)) -> np.ndarray:
+        with self._lock:  # several workers ask
+            now = (self._steps, self.normalizer.count)
+            if self._followed != now:
+                here, there = self.actor, self._player.actor
+                for p, q in zip(there.trunk + there.heads, here.trunk + here.heads, strict=True):
+                    p.copy_(q)
+                self._player.normalizer.mean.copy_(self.normalizer.mean)
+                self._player.normalizer.std.copy_(self.normalizer.std)
+                self._followed = now
+        return self._player.act(obs, goal, heads)
+
+    def update_head(self, k: int | slice, batch: Batch, step: bool = True) -> torch.Tensor:
+        """As `EnsembleDDPG.update_head`, but the losses are in what it returns after the step."""
+        if not self._waiting:
+            self._returned = torch.empty((self.heads, 2), device=self.device)
+        self._waiting.append((k, batch))
+        losses = self._returned[k]
+        if step:
+            waiting, self._waiting = self._waiting, []
+            if [j for j, _ in waiting] == list(range(self.heads)):
+                self._returned.copy_(self._all_heads([batch for _, batch in waiting]).T)
+            else:
+                for j, batch in waiting:
+                    self._returned[j] = super().update_head(j, batch, step=j == k)
+            self._steps += 1
+        return losses
+
+    def _all_heads(self, batches: list[Batch]) -> torch.Tensor:
+        """A step of all heads, each with its mini-batch. Returns the losses, (2, K)."""
+        rows = {
+            name: torch.stack([torch.as_tensor(batch[name]) for batch in batches])
+            for name in ("obs", "action", "next_obs", "goal", "reward", "weight")
+        }
+        if self._batch is None:
+            self._batch = {name: self._tensor(x) for name, x in rows.items()}
+        for name, x in rows.items():
+            self._batch[name].copy_(x)
+        if self.device.type == "cpu":  # in tests
+            return super().update_head(slice(None), self._batch)
+        if self._steps < WARM_UP:
+            stream = torch.cuda.Stream()
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                losses = super().update_head(slice(None), self._batch)
+            torch.cuda.current_stream().wait_stream(stream)
+            return losses
+        if self._graph is None:
+            self._graph = torch.cuda.CUDAGraph()
+            # Algorithm 1's thread goes on meanwhile
+            with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+                self._captured_losses = super().update_head(slice(None), self._batch)
+        self._graph.replay()
+        return self._captured_losses
