@@ -200,6 +200,7 @@ class EnsembleDDPG:
         """Algorithm 2, line 16: one DDPG step of head k, Eqs. (2) and (3), conditioned on goals.
 
         batch: obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,) and weight (B,).
+        k: or a slice of n heads, in one pass, with (n, B, ...) in the batch and losses (2, n).
         It moves head k and both trunks, no other head; both gradients are taken before either step.
         step: False leaves the step to a later call, which then takes one for all heads since the
         last, the trunks' by the sum of their gradients (NOTES.md, "Heads in turn or at once").

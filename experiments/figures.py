@@ -167,7 +167,8 @@ def curves(runs: list[Run], title: str, smooth: float) -> Figure:
         few, many = min(map(len, methods.values())), max(map(len, methods.values()))
         seeds = f"{few}" if few == many else f"{few} to {many}"
         env, _, its_schedule = env.partition("\n")
-        panel = f"{env}, {seeds} seed{'s' * (many > 1)}\n{its_schedule}"
+        between = "\n" if len(env) > 20 else ", "
+        panel = f"{env}{between}{seeds} seed{'s' * (many > 1)}\n{its_schedule}"
         ax.set_title(panel.strip(), fontsize=10)
         ax.set(xlabel="epoch", ylim=(-0.03, 1.03))
         ax.xaxis.get_major_locator().set_params(integer=True)

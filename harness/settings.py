@@ -94,7 +94,10 @@ class Config:
         False, COMPARISON, "herebp, cher, dtgsh with the flaws of their released code"
     )
     device: str = setting(
-        "auto", MACHINE, "where the networks are; auto: a GPU if any", ["auto", "cpu", "cuda"]
+        "auto",
+        MACHINE,
+        "where the networks are; auto: a GPU if any, and if all heads step together",
+        ["auto", "cpu", "cuda"],
     )
     num_workers: int | None = setting(
         None, MACHINE, "processes for the environments (default: one a core)", least=1
@@ -164,7 +167,9 @@ def complete(config: Config) -> Config:
     if config.heads % config.heads_at_once:
         raise UsageError(f"--heads-at-once must divide the {config.heads} heads")
     if config.device == "auto":
-        config.device = "cuda" if torch.cuda.is_available() else "cpu"
+        # Heads in turn are many small calls, which a GPU makes no faster (results/SPEED.md).
+        together = config.heads_at_once == config.heads
+        config.device = "cuda" if together and torch.cuda.is_available() else "cpu"
     if config.device == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda: no CUDA device was found")
     if config.tensorboard and importlib.util.find_spec("tensorboard") is None:

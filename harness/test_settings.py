@@ -62,6 +62,22 @@ def test_a_missing_device_is_named():
     assert settings.complete(Config(device="auto")).device == "cpu"
 
 
+@pytest.mark.parametrize(
+    ("given", "device"),
+    [
+        ({"env": "FetchPush-v1"}, "cuda"),
+        ({"env": "FetchPush-v1", "heads": 1, "method": "her"}, "cuda"),
+        ({"env": "FetchPush-v1", "heads_at_once": 8}, "cpu"),
+        ({"env": "FetchReach-v1"}, "cpu"),
+        ({"env": "FetchReach-v1", "device": "cuda"}, "cuda"),
+        ({"env": "FetchPush-v1", "device": "cpu"}, "cpu"),
+    ],
+)
+def test_a_gpu_is_taken_where_it_is_faster(given, device, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert settings.complete(Config(**given)).device == device
+
+
 def test_a_missing_tensorboard_is_named(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UsageError, match="pip install tensorboard"):
