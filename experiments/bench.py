@@ -24,7 +24,7 @@ from harness.assemble import make_replay
 from harness.numerics import fast_products, one_thread
 from harness.settings import METHODS, Config, complete
 from harness.tasks import examine, make_env
-from harness.workers import ParallelEnvs, available_cores
+from harness.workers import ParallelEnvs, available_cores, whole_heads
 from her import EpisodeBuffer
 from vcp import score, update_her_buffer
 
@@ -147,7 +147,7 @@ def bench_collection(repeats: int, num_envs: int = 16, horizon: int = 50) -> Non
             for action in actions:
                 env.step(action)
 
-        with ParallelEnvs(name, num_envs, min(cores, 16)) as envs:
+        with ParallelEnvs(name, num_envs, whole_heads(None, num_envs, 16)) as envs:
             envs.reset(0)
             t = in_turn({"play": play, "raw": raw}, repeats)
         rate, raw_rate = num_envs * horizon / t["play"], horizon / t["raw"]

@@ -100,7 +100,7 @@ class Config:
         ["auto", "cpu", "cuda"],
     )
     num_workers: int | None = setting(
-        None, MACHINE, "processes for the environments (default: one a core)", least=1
+        None, MACHINE, "processes for the environments (default: one a core, 4 at most)", least=1
     )
 
 

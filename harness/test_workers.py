@@ -54,6 +54,13 @@ def test_workers_hold_whole_heads_or_a_part_of_one():
             np.testing.assert_array_equal(np.concatenate(rows), np.arange(num_envs))
 
 
+def test_many_cores_do_not_make_many_workers(monkeypatch):
+    for cores, workers in ((1, 1), (2, 2), (3, 2), (4, 4), (16, 4)):
+        monkeypatch.setattr("harness.workers.available_cores", lambda n=cores: [*range(n)])
+        assert whole_heads(None, 16, 16) == workers
+        assert whole_heads(16, 16, 16) == 16
+
+
 def test_no_worker_waits_for_another():
     """While one is slow, the other plays on to the end."""
     order = []

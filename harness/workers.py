@@ -219,9 +219,10 @@ class ParallelEnvs:
 
 
 def whole_heads(num_workers: int | None, num_envs: int, heads: int) -> int:
-    """How many workers to take of at most num_workers (None: one a core), so that each has as many
-    environments, those of whole heads or of a part of one."""
-    most = min(num_workers or len(available_cores()), num_envs)
+    """How many workers to take of at most num_workers (None: one a core, and 4 at most), so that
+    each has as many environments, those of whole heads or of a part of one."""
+    # The main process acts for one worker at a time, so that many wait for it (results/SPEED.md).
+    most = min(num_workers or min(len(available_cores()), 4), num_envs)
     return max(
         w for w in range(1, most + 1) if num_envs % w == 0 and (heads % w == 0 or w % heads == 0)
     )
