@@ -127,6 +127,31 @@ def test_it_draws_what_b_h_draws(device, priority, importance):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_the_first_whose_cumulative_probability_is_above(device):
+    """Of four equal ones: 0 is the first's, 1/4 the second's."""
+
+    class Edge:
+        def random(self, shape):
+            return np.array([[0.0, 0.25, 0.75]])
+
+    buffer = HERBufferOnGPU(4, 1.0, "uniform", at_once=1, device=device)
+    rows = np.arange(4, dtype=np.float32)
+    buffer.add({"obs": rows, "hindsight": rows > 1}, rows)
+    buffer.update_priorities()
+    assert buffer.sample(3, Edge())["obs"].tolist() == [0, 1, 3]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_what_was_drawn_before_is_not_handed_out_afterwards(device):
+    buffer, rng = HERBufferOnGPU(4, 1.0, at_once=2, device=device), np.random.default_rng(0)
+    for i in range(3):
+        rows = np.full(4, i, np.float32)
+        buffer.add({"obs": rows, "hindsight": rows > 1}, rows)
+        buffer.update_priorities()
+        assert buffer.sample(3, rng)["obs"].tolist() == [i, i, i]
+
+
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("together", [1, 4])
 @pytest.mark.parametrize("method", ["vcp", "her"])
 def test_a_run_is_the_one_of_the_cpu(device, together, method, tmp_path, monkeypatch):
