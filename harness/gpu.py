@@ -125,7 +125,7 @@ class EnsembleOnGPU(EnsembleDDPG):
                 self._followed = now
         return self._player.act(obs, goal, heads)
 
-    def update_head(self, k: int | slice, batch: Batch, step: bool = True) -> torch.Tensor:
+    def update_head(self, k: int, batch: Batch, step: bool = True) -> torch.Tensor:
         """As `EnsembleDDPG.update_head`, but the losses are in what it returns after the step."""
         if not self._waiting:
             self._returned = torch.empty((self.heads, 2), device=self.device)
