@@ -19,8 +19,8 @@ WARM_UP = 3  # passes before one is captured, as many as in PyTorch's documentat
 
 
 def priorities(variance: torch.Tensor, temperature: float, eps: float = 1e-6) -> torch.Tensor:
-    """`vcp.value_consistency_priority` of a float64 tensor. It does not look for NaN, since that
-    is to wait for the GPU: a NaN gets into the losses, which are looked at after each epoch."""
+    """`vcp.value_consistency_priority` of a float64 tensor. It does not look for NaN, which is to
+    wait for the GPU; `HERBufferOnGPU.add` does, where the variance is still on the CPU."""
     consistency = variance.max() - variance + eps
     priority = (consistency / consistency.max()) ** temperature
     return priority / priority.sum()
@@ -53,10 +53,16 @@ class HERBufferOnGPU(vcp.HERBuffer):
         self.at_once, self.device = at_once, device
         self._drawn: list[Batch] = []
 
-    def add(self, batch: Batch, variance) -> None:
-        rows = {**batch, "variance": variance}
+    def add(self, batch: Batch, variance: np.ndarray) -> None:
+        """As `vcp.HERBuffer.add`; FloatingPointError for a variance that is NaN or Inf."""
+        rows, new = {**batch, "variance": variance}, len(variance)
+        if variance.ndim != 1 or any(len(x) != new for x in rows.values()):
+            raise ValueError(f"the variance is {variance.shape}, one number for each is needed")
+        if new > self.capacity:
+            raise ValueError(f"{new} transitions do not fit into {self.capacity}")
+        if not np.isfinite(variance).all():
+            raise FloatingPointError("NaN or Inf in the variance of the Q-values")
         rows = {name: torch.as_tensor(x, device=self.device) for name, x in rows.items()}
-        new = len(rows["variance"])
         if not self.data:
             self.data = {
                 name: x.new_empty((self.capacity, *x.shape[1:])) for name, x in rows.items()
@@ -136,8 +142,8 @@ class EnsembleOnGPU(EnsembleDDPG):
             if [j for j, _ in waiting] == list(range(self.heads)):
                 self._returned.copy_(self._all_heads([batch for _, batch in waiting]).T)
             else:
-                for j, batch in waiting:
-                    self._returned[j] = super().update_head(j, batch, step=j == k)
+                for i, (j, its) in enumerate(waiting, start=1):
+                    self._returned[j] = super().update_head(j, its, step=i == len(waiting))
             self._steps += 1
         return losses
 

@@ -167,7 +167,7 @@ def complete(config: Config) -> Config:
     if config.heads % config.heads_at_once:
         raise UsageError(f"--heads-at-once must divide the {config.heads} heads")
     if config.device == "auto":
-        # Heads in turn are many small calls, which a GPU makes no faster (results/SPEED.md).
+        # Heads in turn are many small calls, which a GPU hardly makes faster (results/SPEED.md).
         together = config.heads_at_once == config.heads
         config.device = "cuda" if together and torch.cuda.is_available() else "cpu"
     if config.device == "cuda" and not torch.cuda.is_available():

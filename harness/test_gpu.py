@@ -142,6 +142,38 @@ def test_the_first_whose_cumulative_probability_is_above(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(
+    ("variance", "error"),
+    [
+        ([0.1, np.nan], FloatingPointError),
+        ([0.1, np.inf], FloatingPointError),
+        ([0.1], ValueError),
+        ([[0.1], [0.2]], ValueError),
+        ([0.1, 0.2, 0.3], ValueError),
+    ],
+)
+def test_what_b_h_refuses_is_refused(device, variance, error):
+    """Each by the plain buffer too, there in one of its two steps."""
+    for buffer in (HERBuffer(2, 1.0), HERBufferOnGPU(2, 1.0, at_once=1, device=device)):
+        rows = np.zeros(3 if len(variance) == 3 else 2, np.float32)
+        with pytest.raises(error):
+            buffer.add({"obs": rows, "hindsight": rows > 1}, np.float32(variance))
+            buffer.update_priorities()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_two_mini_batches_of_a_head_make_one_step(device):
+    plain, ours = EnsembleDDPG(**SIZES), EnsembleOnGPU(**SIZES, device=device)
+    for agent in (plain, ours):
+        rng = np.random.default_rng(0)
+        for k, step in ((1, False), (2, False), (1, True)):
+            batch = {**mini_batch(rng, 8), "weight": np.ones(8, np.float32)}
+            agent.update_head(k, batch, step)
+    for expected, p in zip(weights(plain), weights(ours), strict=True):
+        torch.testing.assert_close(p, expected, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_what_was_drawn_before_is_not_handed_out_afterwards(device):
     buffer, rng = HERBufferOnGPU(4, 1.0, at_once=2, device=device), np.random.default_rng(0)
     for i in range(3):
