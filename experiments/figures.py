@@ -126,15 +126,21 @@ def said(x: np.ndarray) -> str:
 
 
 def draw_line(ax: Axes, seeds: list[np.ndarray], style: int, text: str, smooth: float) -> None:
-    """The mean over seeds by epoch, as far as all of them have come, and its interval."""
+    """The mean over seeds by epoch, as far as all of them have come, and its interval; where the
+    seeds are too few for one, a thin line for each of them."""
+    seeds = [smoothed(seed, smooth) for seed in seeds]
     shortest = min(map(len, seeds))
-    y = smoothed(np.stack([s[:shortest] for s in seeds]), smooth)
+    y = np.stack([seed[:shortest] for seed in seeds])
     epochs = np.arange(1, shortest + 1)
-    how = {"color": COLOURS[style], "linestyle": DASHES[style], "label": text}
-    ax.plot(epochs, y.mean(axis=0), **how, marker="o" if shortest == 1 else "")  # a line of one
+    how = {"color": COLOURS[style], "linestyle": DASHES[style]}
+    marker = "o" if shortest == 1 else ""  # a line of one
+    ax.plot(epochs, y.mean(axis=0), **how, label=text, marker=marker)
     ends = interval(y)
     if ends:
         ax.fill_between(epochs, *ends, color=COLOURS[style], alpha=0.15, linewidth=0)
+    elif len(seeds) > 1:
+        for seed in seeds:
+            ax.plot(np.arange(1, len(seed) + 1), seed, **how, linewidth=0.7, alpha=0.6)
 
 
 def schedule(c: Config) -> str:
@@ -181,7 +187,7 @@ def curves(runs: list[Run], title: str, smooth: float) -> Figure:
     fig.legend(handles, in_order, loc="outside lower center", ncols=3, fontsize=9, handlelength=3)
     how = f"; smoothed, weight {smooth}" if smooth else ""
     fig.supylabel("test success rate", fontsize=10)
-    means = "mean over seeds, with a 95 % interval from 5 on"
+    means = "mean over seeds, with a 95 % interval from 5 on and each seed's line for fewer"
     fig.suptitle(f"{title}\n{means}; Appendix B's schedule unless said{how}", fontsize=10)
     return fig
 
@@ -210,11 +216,12 @@ def interquartile_mean(x: np.ndarray) -> float:
 
 def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
     """Two tables. For each environment and method, over the epochs that all runs of the environment
-    have: the first with a success of 0.95 and the minutes that one took (medians over seeds), the
-    mean success, and that of the last ones, as `said`. For each method that shares more than one
-    environment with VCP: the interquartile mean of all seeds' mean successes for both, on the
-    shared ones, each of the same weight, with a bootstrap that draws seeds within each. Runs that
-    were stopped before their last epoch are left out."""
+    have and, if the longest of VCP has more, over as many, from the seeds that have them: the first
+    with a success of 0.95 and the minutes that one took (medians over seeds), the mean success, and
+    that of the last ones, as `said`. For each method that shares more than one environment with
+    VCP, over the epochs that all runs have: the interquartile mean of all seeds' mean successes for
+    both, on the shared ones, each of the same weight, with a bootstrap that draws seeds within
+    each. Runs that were stopped before their last epoch are left out."""
     success = defaultdict(lambda: defaultdict(list))
     minutes = defaultdict(list)
     for run in runs:
@@ -226,17 +233,26 @@ def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
         minutes[key, label(run.config)].append(run.rows["wall_seconds"][-1] / epochs / 60)
     lines, means = [], defaultdict(dict)
     for env, methods in sorted(success.items()):
-        epochs = min(len(curve) for seeds in methods.values() for curve in seeds)
-        for name, seeds in sorted(methods.items()):
-            seeds = [curve[:epochs] for curve in seeds]
-            firsts = [np.flatnonzero(curve >= 0.95)[:1] + 1 for curve in seeds]
-            first = np.median([f[0] if len(f) else np.inf for f in firsts])
-            means[name][env] = np.array([curve.mean() for curve in seeds])
-            end = np.array([curve[-last:].mean() for curve in seeds])
-            columns = [f"{len(seeds)}", f"{epochs}", "never" if np.isinf(first) else f"{first:g}"]
-            columns += [said(means[name][env]), said(end)]
-            columns.append(f"{np.median(minutes[env, name]):.2f}")
-            lines.append(f"| {env} | {name} | {' | '.join(columns)} |")
+        shortest = min(len(curve) for seeds in methods.values() for curve in seeds)
+        longest = max(map(len, methods.get("VCP", [])), default=shortest)
+        for epochs in sorted({shortest, longest}):
+            for name, seeds in sorted(methods.items()):
+                seeds = [curve[:epochs] for curve in seeds if len(curve) >= epochs]
+                if not seeds:
+                    continue
+                firsts = [np.flatnonzero(curve >= 0.95)[:1] + 1 for curve in seeds]
+                first = np.median([f[0] if len(f) else np.inf for f in firsts])
+                mean = np.array([curve.mean() for curve in seeds])
+                end = np.array([curve[-last:].mean() for curve in seeds])
+                columns = [
+                    str(len(seeds)),
+                    str(epochs),
+                    "never" if np.isinf(first) else f"{first:g}",
+                ]
+                columns += [said(mean), said(end), f"{np.median(minutes[env, name]):.2f}"]
+                lines.append(f"| {env} | {name} | {' | '.join(columns)} |")
+                if epochs == shortest:
+                    means[name][env] = mean
 
     def total(scores: list[np.ndarray]) -> str:
         seeds = math.lcm(*map(len, scores))  # so that each environment counts the same

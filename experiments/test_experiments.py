@@ -91,7 +91,11 @@ def test_each_figure_has_its_runs(name, lines, results, monkeypatch):
     def keep(*args, **kwargs):
         fig = curves(*args, **kwargs)
         for ax in fig.axes:
-            drawn[ax.get_title()] = [line.get_label() for line in ax.get_lines()]
+            drawn[ax.get_title()] = [line.get_label() for line in ax.get_lines()[::3]]
+            for mean, *seeds in zip(*[iter(ax.get_lines())] * 3, strict=True):  # and each seed's
+                assert [len(line.get_xdata()) for line in (mean, *seeds)] == [6, 6, 7]
+                if mean.get_label() == "VCP":
+                    np.testing.assert_allclose(seeds[1].get_ydata()[:2], [0.21, 0.31])
         legend = [text.get_text() for text in fig.legends[0].get_texts()]
         assert set(legend) == {name for names in drawn.values() for name in names}
         return fig
@@ -314,11 +318,14 @@ def test_no_runs_is_said(tmp_path):
 
 def test_the_summary(results):
     rows = [line.split(" | ") for line in figures.draw("summary", results).read_text().splitlines()]
-    (vcp,) = [r for r in rows if r[:2] == ["| Reacher-v2", "VCP"]]
-    # success .2 .4 .6 .8 1 1 and .21 .41 .61 .81 1 1 1, six epochs that both have
+    vcp, longer = [r for r in rows if r[:2] == ["| Reacher-v2", "VCP"]]
+    # success .2 .4 .6 .8 1 1 and .21 .41 .61 .81 1 1 1, six epochs that both have, seven of one
     assert vcp[2:5] == ["2", "6", "5"]
     assert vcp[5] == "0.670 (0.667 0.673)" and vcp[6] == "0.763 (0.760 0.766)"
     assert vcp[7] == "1.50 |"  # minutes an epoch
+    assert longer[2:7] == ["1", "7", "5", "0.720", "0.884"]
+    (push,) = [r for r in rows if r[:2] == ["| FetchPush-v1", "HER"]]  # where there is no VCP
+    assert push[2:4] == ["1", "6"]
     assert not [r for r in rows if "heads_at_once" in str(r)]  # stopped
     # .35 and .36 twice, beside .667 and .673 twice; the schedule that only VCP has does not count
     (total,) = [r for r in rows if r[0] == "| VCP, 4 heads" and len(r) == 4]
