@@ -2,7 +2,8 @@
 
 WHAT is one of
     effective    how much Eq. (4) prefers, at the paper's temperatures: the effective sample size of
-                 B_h, 1 / Σ p², as a share of its transitions; 100 % is uniform
+                 B_h, 1 / Σ p², as a share of its transitions (100 % is uniform), and the share of
+                 originals among the draws
     replayed     what each method would draw from the run's B_o: the share of originals, and of
                  transitions whose goal is still ahead (r = -1), among all draws and weighted by the
                  paper's weights. In a task with an object the others are mostly at their goal
@@ -39,9 +40,9 @@ def effective(its: Parts) -> list[str]:
     """A cell for each of the TEMPERATURES. UsageError for a run without B_h."""
     if its.her_buffer is None:
         raise UsageError(f"a run of --method {its.config.method} has no B_h")
-    variance = its.her_buffer.data["variance"][: its.her_buffer.size]
-    priorities = [value_consistency_priority(variance, t) for t in TEMPERATURES]
-    return [f"{effective_share(p):.1%}" for p in priorities]
+    data = {name: x[: its.her_buffer.size] for name, x in its.her_buffer.data.items()}
+    priorities = [value_consistency_priority(data["variance"], t) for t in TEMPERATURES]
+    return [f"{effective_share(p):.1%}; {p[~data['hindsight']].sum():.1%}" for p in priorities]
 
 
 def drawn(its: Parts, method: str, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -112,7 +113,7 @@ def dead(its: Parts) -> list[str]:
 
 
 TABLES = {
-    "effective": (effective, [f"𝒯 = {t}" for t in TEMPERATURES]),
+    "effective": (effective, [f"𝒯 = {t}: size; originals" for t in TEMPERATURES]),
     "replayed": (replayed, [f"{method.upper()}: originals; ahead" for method in METHODS]),
     "dead": (dead, ["actor's trunk", "actors' heads", "critic's trunk", "critics' heads"]),
 }

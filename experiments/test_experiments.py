@@ -202,8 +202,22 @@ def test_the_effective_sample_size(tmp_path, capsys):
     sweep.main(arguments(tmp_path, "--task", "0"))
     inspect_run.main(["effective", str(folder_of(tmp_path))])
     line = capsys.readouterr().out.splitlines()[-1].split(" | ")
-    shares = [float(x.rstrip("% |")) for x in line[2:]]
-    assert line[1] == "2" and len(shares) == 5 and shares == sorted(shares, reverse=True)
+    shares = [[float(x.rstrip("% |")) for x in cell.split("; ")] for cell in line[2:]]
+    sizes, originals = zip(*shares, strict=True)
+    assert line[1] == "2" and len(sizes) == 5 and sizes == tuple(sorted(sizes, reverse=True))
+    assert originals[0] > originals[-1]
+
+
+def test_the_share_of_originals_by_temperature():
+    """V = 0, 0.5 and 1: originals have half of hindsight's consistency, one transition none."""
+    hindsight = np.arange(101) % 5 > 0  # 20 originals, 80 others, and the one with V = 1
+    variance = np.append(np.where(hindsight[:100], 0.0, 0.5), 1.0)
+    data = {"variance": variance, "hindsight": np.append(hindsight[:100], True)}
+    beyond = {name: np.append(x, x[:7]) for name, x in data.items()}  # what B_h does not hold yet
+    its = SimpleNamespace(her_buffer=SimpleNamespace(size=101, data=beyond))
+    cells = [cell.split("; ")[1] for cell in inspect_run.effective(its)]
+    # 20 · 0.5^𝒯 / (20 · 0.5^𝒯 + 80)
+    assert cells == ["11.1%", "0.8%", "0.0%", "0.0%", "0.0%"]
 
 
 def test_what_each_method_replays(tmp_path, capsys):
