@@ -27,8 +27,8 @@ ARROWS = {
 
 def modules() -> dict[str, Path]:
     """Every module that is no test, by its dotted name."""
-    files = [HERE / f"{name}.py" for name in CORE]
-    files += [file for room in ROOMS for file in (HERE / room).glob("*.py")]
+    files = [HERE / f"{name}.py" for name in sorted(CORE)]
+    files += [file for room in ROOMS for file in sorted((HERE / room).glob("*.py"))]
     names = [".".join(file.relative_to(HERE).with_suffix("").parts) for file in files]
     tests = ("test_", "testing", "conftest")
     pairs = zip(names, files, strict=True)
