@@ -8,7 +8,6 @@ import copy
 import itertools
 import math
 import threading
-import time
 import timeit
 from decimal import Decimal, localcontext
 from fractions import Fraction
@@ -275,7 +274,7 @@ def test_future_relabelling_draws_later_steps_of_the_same_episode():
     np.testing.assert_array_equal(batch["hindsight"], relabelled)
     np.testing.assert_array_equal(batch["action"], -batch["obs"] / 10)
     np.testing.assert_array_equal(batch["next_obs"] - batch["obs"], [[0, 10]] * len(e))
-    np.testing.assert_array_equal(batch["goal"][~relabelled], -1)
+    np.testing.assert_array_equal(batch["goal"][~relabelled], -1 - e[~relabelled, None] * [1, 1])
 
     # 80 % relabelled, 20 % original, whatever the episode and step
     assert abs(relabelled.mean() - 0.8) < 5 * math.sqrt(0.16 / len(e))
@@ -318,7 +317,7 @@ def test_relabelling_of_any_episodes(n, horizon, size, ratio, seed):
     goal_episode, future = batch["goal"].T
     assert np.all(goal_episode[relabelled] == e[relabelled])
     assert np.all((t < future)[relabelled] & (future <= horizon)[relabelled])
-    assert np.all(batch["goal"][~relabelled] == -1)
+    assert np.all(batch["goal"][~relabelled].T == -1 - e[~relabelled])  # the episode's own
     reached = (batch["next_obs"] == 10 * batch["goal"]).all(axis=1)
     np.testing.assert_array_equal(batch["reward"], reached - 1.0)
 
@@ -467,8 +466,9 @@ def test_a_head_is_trained_through_its_network_with_any_optimiser():
 def test_updates_are_those_of_plain_ddpg(together):
     """Eqs. (2) and (3), step by step, against plain modules, plain Adam and the textbook's loss:
     own targets, clipping, weights, gradients before steps, one Adam of the trunk for all heads. Of
-    heads that step together the trunk's gradients are added up."""
-    agent = random_agent(heads=3)
+    heads that step together the trunk's gradients are added up. The gradients themselves are
+    compared too, as Adam's step hides their scale."""
+    agent = random_agent(heads=3, action_penalty=0.3)
     actors, critics = plain_ensemble(agent.actor, True), plain_ensemble(agent.critic, False)
     target_actors = plain_ensemble(agent.target_actor, True)
     target_critics = plain_ensemble(agent.target_critic, False)
@@ -478,6 +478,9 @@ def test_updates_are_those_of_plain_ddpg(together):
         for k in range(3)
     ]
     assert all(net.trunk is nets[0].trunk for nets in (actors, critics) for net in nets)
+    params = [*agent.actor.parameters(), *agent.critic.parameters()]
+    gradients = {}  # with which the agent last stepped
+    agent.optimizer.register_step_pre_hook(lambda *_: gradients.update({p: p.grad for p in params}))
     moved = set()
     for i, k in enumerate([1, 2, 1, 0, 1] if together == 1 else [0, 1, 2, 0, 1, 2]):
         batch = random_batch(seed=i)
@@ -487,21 +490,25 @@ def test_updates_are_those_of_plain_ddpg(together):
             y = torch.clip(y, -1 / (1 - 0.9), 0)
         critic_loss = (weight * (critics[k](state, action) - y) ** 2).mean()
         pi = actors[k](state)
-        actor_loss = -(weight * critics[k](state, pi)).mean() + (weight * pi**2).mean()
+        actor_loss = -(weight * critics[k](state, pi)).mean() + 0.3 * (weight * pi**2).mean()
         for loss, net in ((critic_loss, critics[k]), (actor_loss, actors[k])):
-            params = [*net.parameters()]
-            for p, g in zip(
-                params, torch.autograd.grad(loss, params, retain_graph=True), strict=True
-            ):
+            its_params = [*net.parameters()]
+            its_gradients = torch.autograd.grad(loss, its_params, retain_graph=True)
+            for p, g in zip(its_params, its_gradients, strict=True):
                 p.grad = g if p.grad is None else p.grad + g
         moved.add(k)
         step = (i + 1) % together == 0
+        losses = agent.update_head(k, batch, step)
         if step:
+            for plain, net in ((actors, agent.actor), (critics, agent.critic)):
+                for j in moved:
+                    own = [gradients[p] for p in (*net.trunk, *net.own[j])]
+                    expected = [p.grad for p in plain[j].parameters()]
+                    torch.testing.assert_close(own, expected, rtol=1e-3, atol=1e-5)
             for optimizer in (*trunks, *(adam for k in moved for adam in heads[k])):
                 optimizer.step()
                 optimizer.zero_grad()
             moved = set()
-        losses = agent.update_head(k, batch, step)
         torch.testing.assert_close(
             losses, torch.stack([critic_loss, actor_loss]).detach(), rtol=1e-4, atol=1e-5
         )
@@ -541,15 +548,15 @@ def test_targets_are_clipped_to_the_range_of_returns():
 
 
 def test_polyak_moves_the_shared_trunk_once_for_each_head():
-    agent = random_agent(heads=5)
+    agent = random_agent(heads=5, polyak=0.9)
     expected = []
     for target, net in ((agent.target_actor, agent.actor), (agent.target_critic, agent.critic)):
         trunk, heads = copy.deepcopy(target.trunk), copy.deepcopy(target.heads)
         for k in range(5):  # as it is said: for each head, its trunk and its head
             for p, q in zip(trunk, net.trunk, strict=True):
-                p.mul_(0.95).add_(0.05 * q.detach())
+                p.mul_(0.9).add_(0.1 * q.detach())
             for p, q in zip(heads, net.heads, strict=True):
-                p[k] = 0.95 * p[k] + 0.05 * q[k].detach()
+                p[k] = 0.9 * p[k] + 0.1 * q[k].detach()
         expected.append((trunk, heads))
     agent.update_targets()
     for target, (trunk, heads) in zip(
@@ -786,6 +793,7 @@ def test_train_does_what_algorithm_2_says(
     which are updated in turn, each with a mini-batch of its own; the targets once a cycle; the
     normaliser fed with every step."""
     calls, agents, goals, scores, frozen, threads = [], [], [], [], [], set()
+    heads_moved = threading.Event()
 
     class Spy(EnsembleDDPG):
         def __init__(self, *args, **kwargs):
@@ -795,7 +803,10 @@ def test_train_does_what_algorithm_2_says(
         def update_head(self, k, batch, step):
             calls.append((k, batch["obs"].tobytes()))
             assert len(batch["obs"]) == 16 and step is (k in steps)
-            return super().update_head(k, batch, step)
+            losses = super().update_head(k, batch, step)
+            if k == 3:
+                heads_moved.set()
+            return losses
 
         def update_targets(self):
             calls.append("targets")
@@ -816,8 +827,9 @@ def test_train_does_what_algorithm_2_says(
         return update_her_buffer(her_buffer, original_buffer, q_variance, size, *args)
 
     def spy_score(original_buffer, q_variance, size, *args):
-        """Lines 3-5, slowed down until the heads have moved on."""
-        time.sleep(0.1)
+        """Lines 3-5, not before the heads have moved on."""
+        assert heads_moved.wait(timeout=60)
+        heads_moved.clear()
         threads.add(threading.current_thread())
         batch, variance = score(original_buffer, q_variance, size, *args)
         rows = [batch[name] for name in ("obs", "action", "goal")]
@@ -852,7 +864,7 @@ def test_train_does_what_algorithm_2_says(
     assert threading.current_thread() not in threads and len(threads) == 1
     assert len(scores) == len(frozen) == 6
     for (variance, rows, moved), critics in zip(scores, frozen, strict=True):
-        np.testing.assert_array_equal(variance, critics.q_variance(*rows))
+        np.testing.assert_allclose(variance, critics.q_variance(*rows), rtol=1e-3, atol=1e-6)
         assert np.abs(variance - moved).max() > 1e-4
     # scored for each one drawn: 2, in each sweep
     drawn = 4 * 16
@@ -955,24 +967,26 @@ def test_the_same_seed_gives_the_same_rows(tmp_path):
 
 
 def test_each_seed_and_epoch_has_random_numbers_of_its_own(tmp_path, monkeypatch):
-    resets, streams = [], []
+    """Seeds of the environments; what episodes, Algorithm 1 and draws take, each its own stream."""
+    resets, streams = [], {"exploring": [], "score": [], "sample": []}
 
-    def spy_reset(self, seed):
-        resets.append(seed)
-        return reset(self, seed)
+    def spy(owner, name, note):
+        function = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *args: (note(*args), function(*args))[1])
 
-    def spy(policy, rng, *args):
-        streams.append(rng.bit_generator.state["state"]["state"])
-        return exploring(policy, rng, *args)
+    def stream(name, place):  # a PCG64's increment tells its stream from all others
+        return lambda *args: streams[name].append(args[place].bit_generator.state["state"]["inc"])
 
-    reset, exploring = ParallelEnvs.reset, run.exploring
-    monkeypatch.setattr(ParallelEnvs, "reset", spy_reset)
-    monkeypatch.setattr(run, "exploring", spy)
+    spy(ParallelEnvs, "reset", lambda envs, seed: resets.append(seed))
+    spy(run, "exploring", stream("exploring", 1))
+    spy(run, "score", stream("score", 3))
+    spy(HERBuffer, "sample", stream("sample", 2))
     settings = {**SMALL_TRAINING, "env": "PointMassEmptyEnv-v1", "epochs": 2, "num_workers": 1}
     for seed in (0, 1):
         train(Config(**settings, seed=seed, out=str(tmp_path / str(seed))))
     assert len(resets) == len(set(resets)) == 2 * 2 * 2  # seeds, epochs, training and testing
-    assert len(streams) == len(set(streams)) == 2 * (3 + 2)
+    assert {name: len(set(used)) for name, used in streams.items()} == dict.fromkeys(streams, 4)
+    assert len(set().union(*streams.values())) == 3 * 4
 
 
 @pytest.mark.parametrize(

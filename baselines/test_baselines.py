@@ -47,15 +47,16 @@ def stored(achieved_goal, **others):
 
 def hindsight_frequencies(batch, n, horizon):
     """How often each (episode, step, goal's step) was drawn, and its probability in HER: the goal's
-    step t' is one of t+1..T with probability 0.8, and -1, the original goal, with 0.2."""
+    step t' is one of t+1..T with probability 0.6, and -1, the episode's own goal, with 0.4."""
     e, t = batch["obs"].T.astype(int) // 10
     later = batch["goal"][:, 1].astype(int)
+    later = np.where(later < 0, np.where(later == -1 - e, -1, -2), later)  # -2: another episode's
     counts, probabilities = [], []
     for episode, step in itertools.product(range(n), range(horizon)):
         here = (e == episode) & (t == step)
         for goal_step in (-1, *range(step + 1, horizon + 1)):
             counts.append(np.sum(here & (later == goal_step)))
-            share = 0.2 if goal_step == -1 else 0.8 / (horizon - step)
+            share = 0.4 if goal_step == -1 else 0.6 / (horizon - step)
             probabilities.append(share / (n * horizon))
     assert np.sum(counts) == len(e)  # nothing else was drawn
     return counts, probabilities
@@ -67,7 +68,7 @@ def test_vcp_without_prioritization_samples_like_her():
     buffer = EpisodeBuffer(n * horizon, horizon, 2, 2, 2)
     buffer.add(numbered_episodes(n, horizon), rng)
 
-    her = HERReplay(buffer, 0.8, exact_reward, at_once=5)
+    her = HERReplay(buffer, 0.6, exact_reward, at_once=5)
     batches = [her.sample(2_000, rng) for _ in range(15)]
     drawn = {name: np.concatenate([b[name] for b in batches]) for name in batches[0]}
     assert_frequencies(*hindsight_frequencies(drawn, n, horizon))
@@ -75,7 +76,7 @@ def test_vcp_without_prioritization_samples_like_her():
 
     agent = EnsembleDDPG(2, 2, 2, gamma=0.98, heads=2)
     her_buffer = HERBuffer(300_000, temperature=9, priority="uniform")
-    update_her_buffer(her_buffer, buffer, agent.q_variance, 300_000, rng, 0.8, exact_reward)
+    update_her_buffer(her_buffer, buffer, agent.q_variance, 300_000, rng, 0.6, exact_reward)
     drawn = her_buffer.sample(30_000, rng)
     assert_frequencies(*hindsight_frequencies(drawn, n, horizon))
     np.testing.assert_allclose(drawn["weight"], 1, rtol=1e-6)
@@ -192,15 +193,16 @@ def test_herebp_draws_episodes_by_their_energy():
     speeds = np.array([0, 0.2, 0.5, 1])
     achieved = np.concatenate([path([v] * 5) for v in speeds])
     buffer, rng = stored(achieved), np.random.default_rng(0)
-    replay = HEREBP(buffer, 0.8, exact_reward, env_name="FetchPush-v1", dt=DT, temperature=3)
-    replay.new_episodes(np.arange(4))
+    replay = HEREBP(buffer, 0.6, exact_reward, env_name="FetchPush-v1", dt=DT, temperature=3)
+    for slots in ([0, 1], [2, 3]):  # two collections
+        replay.new_episodes(np.array(slots))
     energy = np.minimum(speeds**2 / 2, 0.5) + EPSILON
     expected = energy ** (1 / 3.01) / np.sum(energy ** (1 / 3.01))
     batch = replay.sample(100_000, rng)
     e, t = batch["obs"].T.astype(int) // 10
     assert_frequencies(np.bincount(e, minlength=4), expected)
     assert_frequencies(np.bincount(t, minlength=5), np.full(5, 0.2))
-    assert abs(batch["hindsight"].mean() - 0.8) < 0.01
+    assert abs(batch["hindsight"].mean() - 0.6) < 0.01
     later = np.round((batch["goal"] - achieved[e, t])[:, 0] / (speeds[e] * DT + 1e-9))
     assert ((later >= 1) & (later <= 5 - t))[batch["hindsight"] & (e > 0)].all()
     # an episode that is overwritten loses its energy
@@ -323,11 +325,13 @@ def test_cher_weighs_proximity_more_and_more_and_starts_again(monkeypatch):
 
     monkeypatch.setattr("baselines.cher.select", spy)
     buffer = stored(numbered_episodes(4, 50)["achieved_goal"])
-    replay = CHER(buffer, 0.8, exact_reward, env_name="FetchPush-v1", heads=2, updates=6, at_once=4)
+    replay = CHER(buffer, 0.6, exact_reward, env_name="FetchPush-v1", heads=2, updates=6, at_once=4)
     rng = np.random.default_rng(0)
     batches = [replay.sample(8, rng) for _ in range(16)]
     tau = [round(math.log(x) / math.log(1.0001)) for _, _, p in seen for x in p]
     assert tau == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 0, 0, 1, 1]
+    candidates = np.concatenate([goal for goal, *_ in seen]).reshape(-1, 2)
+    assert abs((candidates[:, 0] >= 0).mean() - 0.6) < 0.15  # 256 of them; 5 sigma
     goal, achieved, _ = seen[0]
     assert goal.shape == achieved.shape == (4, 16, 2)
     for u, batch in enumerate(batches[:4]):  # drawn together, used in the order of their τ
@@ -339,6 +343,9 @@ def test_cher_weighs_proximity_more_and_more_and_starts_again(monkeypatch):
     nexts = np.concatenate([b["next_obs"] for b in batches]) / 10
     goals = np.concatenate([b["goal"] for b in batches])
     np.testing.assert_array_equal(rewards, exact_reward(nexts, goals))
+    np.testing.assert_array_equal(
+        np.concatenate([b["hindsight"] for b in batches]), goals[:, 0] >= 0
+    )
 
 
 @pytest.mark.parametrize("method", [CHER, DTGSH])
@@ -440,15 +447,18 @@ def test_dtgsh_draws_episodes_by_their_diversity(monkeypatch):
         return np.tile(np.arange(k), (len(kernel), 1))
 
     monkeypatch.setattr("baselines.dtgsh.sample_k_dpp", first)
-    replay = DTGSH(buffer, 0.8, exact_reward, env_name="PointMassEmptyEnv-v1", at_once=400)
-    replay.new_episodes(np.arange(4))
+    replay = DTGSH(buffer, 0.6, exact_reward, env_name="PointMassEmptyEnv-v1", at_once=400)
+    for slots in ([0, 1], [2, 3]):  # two collections
+        replay.new_episodes(np.array(slots))
     rng = np.random.default_rng(0)
     batches = [replay.sample(64, rng) for _ in range(400)]
     drawn = {name: np.concatenate([b[name] for b in batches]) for name in batches[0]}
     e, t = drawn["obs"].T.astype(int) // 10
     assert_frequencies(np.bincount(e, minlength=4), np.array([0, 1, 2, 3]) / 6)
     assert_frequencies(np.bincount(t, minlength=5), np.full(5, 0.2))
-    assert abs(drawn["hindsight"].mean() - (1 - 64 * 0.2 / 100)) < 0.01
+    assert abs(drawn["hindsight"].mean() - (1 - 64 * 0.4 / 100)) < 0.01
+    own = (drawn["goal"].T == -1 - e).all(axis=0)  # corners are no such goals
+    np.testing.assert_array_equal(drawn["hindsight"], ~own)
     (kernel,) = kernels
     assert kernel.shape == (400, 100, 100)
     first = batches[0]["goal"].astype(float)

@@ -72,6 +72,7 @@ class HERBufferOnGPU(vcp.HERBuffer):
             self.data[name][slots] = x
         self._next = (self._next + new) % self.capacity
         self.size = min(self.size + new, self.capacity)
+        self.probabilities, self._drawn = np.empty(0), []  # the older ones no longer hold
 
     def update_priorities(self) -> None:
         variance = self.data["variance"][: self.size].double()
@@ -82,6 +83,8 @@ class HERBufferOnGPU(vcp.HERBuffer):
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
         """As `vcp.HERBuffer.sample`, as tensors; "hindsight" is 0 or 1."""
+        if not len(self.probabilities):
+            raise ValueError("B_h has no priorities: call update_priorities() after add()")
         if not self._drawn:
             u = torch.as_tensor(rng.random((self.at_once, batch_size)), device=self.device)
             i = torch.searchsorted(self._cumulative, u, right=True)  # (at_once, B)

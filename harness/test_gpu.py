@@ -179,8 +179,15 @@ def test_what_was_drawn_before_is_not_handed_out_afterwards(device):
     for i in range(3):
         rows = np.full(4, i, np.float32)
         buffer.add({"obs": rows, "hindsight": rows > 1}, rows)
+        with pytest.raises(ValueError, match="call update_priorities"):
+            buffer.sample(3, rng)
         buffer.update_priorities()
         assert buffer.sample(3, rng)["obs"].tolist() == [i, i, i]
+        buffer.update_priorities()  # of two drawn at once one is left
+        state = rng.bit_generator.state
+        assert (
+            buffer.sample(3, rng)["obs"].tolist() == [i, i, i] and rng.bit_generator.state != state
+        )
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -10,7 +10,8 @@ from harness.numerics import fast_products, one_thread, small_calls
 from harness.testing import HERE, SMALL_TRAINING
 
 
-def test_fast_products_are_float32_or_left_alone(monkeypatch):
+@pytest.mark.parametrize("call", ["mm", "bmm", "addmm", "baddbmm"])
+def test_fast_products_are_float32_or_left_alone(call, monkeypatch):
     torch.manual_seed(0)
     setting, x, w = torch.backends.mkldnn.matmul, torch.randn(256, 300), torch.randn(300, 256)
     before, threads = setting.fp32_precision, torch.get_num_threads()
@@ -27,11 +28,12 @@ def test_fast_products_are_float32_or_left_alone(monkeypatch):
     torch.set_num_threads(threads)
     assert setting.fp32_precision == before
 
-    def rounded(a, b):
-        return torch.mm(a.bfloat16().float(), b.bfloat16().float())
+    exact = getattr(torch, call)
 
-    assert (rounded(x, w) - x @ w).abs().max() > 1e-2
-    monkeypatch.setattr(torch.Tensor, "__matmul__", rounded)  # a processor that rounds
+    def rounded(*tensors):
+        return exact(*(t.bfloat16().float() for t in tensors))
+
+    monkeypatch.setattr(torch, call, rounded)  # a processor that rounds
     with fast_products():
         assert setting.fp32_precision == before
 

@@ -40,11 +40,27 @@ def test_with_many_updates_the_heads_step_together(given, together):
         settings.complete(Config(**{**given, "heads_at_once": 5}))
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"relabel_ratio": 0.0, "polyak": 0.0, "random_actions": 0.0, "noise": 0.0, "seed": 0},
+        {"relabel_ratio": 1.0, "polyak": 1.0, "random_actions": 1.0, "seed": 2**32 - 1},
+        {"action_penalty": 0.0, "temperature": 0.0, "heads": 1, "updates": 1, "batch_size": 1},
+        {"epochs": 1, "cycles": 1, "eval_episodes": 1, "episode_length": 1, "buffer_size": 1},
+        {"heads_at_once": 1, "num_workers": 1, "her_buffer_capacity": 16_384},
+    ],
+)
+def test_the_ends_of_a_range_belong_to_it(given):
+    config = settings.complete(Config(env="FetchPush-v1", **given))
+    assert {name: getattr(config, name) for name in given} == given
+
+
 def test_what_is_scored_fits_into_the_buffer():
     sweep = {"heads": 4, "batch_size": 8}  # draws 32
     for given, capacity in (
         ({"updates": 5}, 160),
         ({"updates": 1, "scored_per_drawn": 2.5}, 80),
+        ({"updates": 1, "scored_per_drawn": 2.49}, 80),  # the nearest number
         ({"updates": 5, "her_buffer_capacity": 40}, 40),
     ):
         assert settings.complete(Config(**sweep, **given)).her_buffer_capacity == capacity

@@ -381,6 +381,16 @@ def test_a_wrappers_own_reward_is_what_is_learned_from():
     np.testing.assert_array_equal(rewards, [0, -1, -1])
 
 
+def test_without_is_success_the_reward_says_what_succeeded():
+    with ParallelEnvs("Wrapped-v0", 8, 1) as envs:
+        envs.reset(0)
+        to_most_goals = lambda t, rows, obs, goal: np.clip((goal - obs) / 0.2, -0.3, 0.3)  # noqa: E731
+        episodes, success = run.rollout(envs, to_most_goals, 10)
+    away = np.abs(episodes["obs"][:, -1] - episodes["desired_goal"])[:, 0]
+    np.testing.assert_array_equal(success, away <= 0.3)
+    assert success.any() and not success.all()
+
+
 def test_the_episode_length_can_be_given(tmp_path):
     assert examine("NoLength-v0", 7).horizon == 7 and examine("FetchReach-v1", 20).horizon == 20
     assert examine("HasAClock-v0", 5).horizon == 5  # its own clock's last step is no early end

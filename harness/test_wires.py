@@ -10,8 +10,9 @@ import torch
 import run
 from baselines.cher import CHER
 from baselines.dtgsh import DTGSH
+from baselines.her import HERReplay
 from baselines.herebp import HEREBP
-from ensemble import EnsembleDDPG
+from ensemble import EnsembleDDPG, Normalizer
 from envs_point import PointMass, SparseReacher
 from harness import assemble as rooms
 from harness.assemble import assemble
@@ -64,13 +65,14 @@ def spied(tmp_path, monkeypatch):
 
         monkeypatch.setattr(owner, name, replacement)
 
-    spy(rooms, "EnsembleDDPG", "agent", lambda a, k, result: k)
+    spy(rooms, "EnsembleDDPG", "agent", lambda a, k, result: (k, result))
     spy(rooms, "HERBuffer", "b_h", lambda a, k, result: (k, result))
-    spy(run, "relabel_future", "ratio", lambda a, k, result: (a[3], result))
+    spy(run, "relabel_future", "ratio", lambda a, k, result: (a[3], len(a[0]["obs"]), result))
+    spy(Normalizer, "update", "normalised", lambda a, k, result: a[1])
     spy(run, "exploring", "exploring", lambda a, k, result: a[2:])
     spy(run, "rollout", "success", lambda a, k, result: result)
     spy(EnsembleDDPG, "act", "acted", lambda a, k, result: (a[1].shape, result))
-    spy(EnsembleDDPG, "value", "values", lambda a, k, result: result)
+    spy(EnsembleDDPG, "value", "values", lambda a, k, result: (*a[1:], result))
     spy(EnsembleDDPG, "update_head", "losses", lambda a, k, result: result.numpy())
     spy(torch.optim.Adam, "step", "steps", lambda a, k, result: None)
     spy(HERBuffer, "sample", "batches", lambda a, k, result: result)
@@ -83,7 +85,7 @@ def spied(tmp_path, monkeypatch):
 
 def test_each_setting_arrives(spied):
     seen, scored, _ = spied
-    (agent,), ((b_h, _),) = seen["agent"], seen["b_h"]
+    ((agent, _),), ((b_h, _),) = seen["agent"], seen["b_h"]
     assert agent["heads"] == 4 and agent["gamma"] == 0.95  # 1 - 1/20
     assert agent["learning_rate"] == 2e-3
     assert agent["polyak"] == 0.9 and agent["action_penalty"] == 0.33
@@ -95,7 +97,7 @@ def test_each_setting_arrives(spied):
         "importance": "inverse",
     }
     # the normaliser's goals and those that Algorithm 1 scores; 4 heads x 24 transitions x 1.5
-    assert {ratio for ratio, _ in seen["ratio"]} == {0.6} and set(scored) == {(144, 0.6)}
+    assert {ratio for ratio, *_ in seen["ratio"]} == {0.6} and set(scored) == {(144, 0.6)}
     # T, environments, actions; the warm-up is all random
     assert seen["exploring"] == [((20, 16, 2), 0.11, share) for share in (1, 0.22, 0.22, 0.22)]
     assert {len(batch["obs"]) for batch in seen["batches"]} == {24}
@@ -105,11 +107,13 @@ def test_each_setting_arrives(spied):
     assert shapes == 4 * 20 * [(1, 16, 2)] + 3 * 20 * [(4, 4, 2)]
 
 
-def test_the_normaliser_sees_relabelled_goals_and_all_steps(spied):
+def test_the_normaliser_sees_relabelled_goals_and_all_steps_of_the_new_episodes(spied):
     seen, _, _ = spied
-    assert len(seen["ratio"]) == 4
-    for _, batch in seen["ratio"]:
+    assert len(seen["ratio"]) == len(seen["normalised"]) == 4
+    for (_, episodes, batch), x in zip(seen["ratio"], seen["normalised"], strict=True):
+        assert episodes == 16  # not those before them
         assert len(batch["obs"]) == 320 and 0.5 < batch["hindsight"].mean() < 0.7
+        np.testing.assert_array_equal(x, np.hstack([batch["obs"], batch["goal"]]))
 
 
 def test_evaluation_has_no_noise_and_all_its_rounds(spied):
@@ -120,6 +124,10 @@ def test_evaluation_has_no_noise_and_all_its_rounds(spied):
     played = np.stack([episodes["action"] for episodes, _ in tests]).transpose(0, 2, 1, 3)
     np.testing.assert_array_equal(acted, played)
     assert row["test_success_rate"] == np.mean([success for _, success in tests])
+    # Q of what the heads saw before they acted, with the goal they were to reach
+    for (episodes, _), (obs, goal, _) in zip(tests, seen["values"], strict=True):
+        np.testing.assert_array_equal(obs.reshape(16, 20, 2), episodes["obs"][:, :20])
+        np.testing.assert_array_equal(goal.reshape(16, 20, 2)[:, 7], episodes["desired_goal"])
 
 
 def test_the_columns_are_what_they_say(spied):
@@ -127,11 +135,18 @@ def test_the_columns_are_what_they_say(spied):
     losses = np.mean(seen["losses"], axis=0)
     np.testing.assert_allclose([row["critic_loss"], row["actor_loss"]], losses, rtol=1e-5)
     assert row["train_success_rate"] == np.mean([s for _, s in seen["success"][1:4]])
-    np.testing.assert_allclose(row["test_q"], np.mean(seen["values"]), rtol=1e-6)
+    np.testing.assert_allclose(row["test_q"], np.mean([q for *_, q in seen["values"]]), rtol=1e-5)
     originals = np.mean([1 - batch["hindsight"].mean() for batch in seen["batches"]])
     np.testing.assert_allclose(row["batch_original_fraction"], originals)
     assert row["epoch"] == 1 and row["env_steps"] == 16 * 20 * 4
     assert row["her_buffer_size"] == 333
+    ((_, agent),), ((_, b_h),) = seen["agent"], seen["b_h"]
+    variance = agent.q_variance(*(b_h.data[name] for name in ("obs", "action", "goal")))
+    hindsight = b_h.data["hindsight"]
+    expected = [variance[hindsight].mean(), variance[~hindsight].mean()]
+    ours = [row["variance_hindsight"], row["variance_original"]]
+    np.testing.assert_allclose(ours, expected, rtol=1e-3)
+    assert abs(ours[0] - ours[1]) > 0.1 * ours[0]  # so that one is not taken for the other
     assert 0 < row["collect_seconds"] + row["train_seconds"] + row["eval_seconds"]
     assert row["collect_seconds"] + row["train_seconds"] < row["wall_seconds"]
 
@@ -139,15 +154,17 @@ def test_the_columns_are_what_they_say(spied):
 @pytest.mark.parametrize(
     ("method", "settings", "expected"),
     [
+        (HERReplay, {"updates": 4}, {"at_once": 16}),
         (CHER, {"cycles": 3, "updates": 4, "faithful": True}, {"updates": 12, "faithful": True}),
         (DTGSH, {"faithful": True}, {"faithful": True, "sigma": 0.5, "most": 0.001}),
         (HEREBP, {"faithful": True}, {"settings": (0.04, 0.5, True)}),
     ],
 )
 def test_the_other_methods_get_theirs(method, settings, expected):
-    name = method.__name__.lower()
-    replay = assemble(complete(Config("FetchPush-v1", name, heads=4, **settings))).replay
-    assert type(replay) is method and replay.relabel_ratio == 0.8
+    name = method.__name__.lower().removesuffix("replay")
+    common = {"env": "FetchPush-v1", "heads": 4, "relabel_ratio": 0.6}
+    replay = assemble(complete(Config(method=name, **common, **settings))).replay
+    assert type(replay) is method and replay.relabel_ratio == 0.6
     assert {k: getattr(replay, k) for k in expected} == expected
     assert name != "cher" or replay.heads == 4
 
