@@ -165,7 +165,12 @@ class EnsembleDDPG:
     @torch.no_grad()
     def act(self, obs: np.ndarray, goal: np.ndarray, heads: slice = slice(None)) -> np.ndarray:
         """Algorithm 2, line 7, without noise: a = μ_k(s, g) for all heads in one call.
-        obs (K, E, O) and goal (K, E, G) -> (K, E, A); `heads` picks which K heads act."""
+        obs (K, E, O) and goal (K, E, G) -> (K, E, A); `heads` picks which K heads act. ValueError
+        for rows of another number of heads."""
+        acting = len(range(self.heads)[heads])
+        if not (np.ndim(obs) == np.ndim(goal) == 3 and len(obs) == len(goal) == acting):
+            shapes = f"obs is {np.shape(obs)} and goal {np.shape(goal)}"
+            raise ValueError(f"{shapes}, and must be ({acting}, rows of each head, numbers)")
         return self.actor.all_heads(self._state(obs, goal), heads).cpu().numpy()
 
     @torch.no_grad()

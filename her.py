@@ -41,8 +41,12 @@ class EpisodeBuffer:
     def add(self, episodes: dict[str, np.ndarray], rng: np.random.Generator) -> np.ndarray:
         """Algorithm 2, line 9, for whole episodes. Once full, random old episodes make room (not in
         the paper; HER's code does so). Returns the rows they went to. ValueError for more
-        episodes than the buffer holds."""
+        episodes than the buffer holds, and for an array of another shape."""
         new = len(episodes["action"])
+        for name, array in self._data.items():
+            shape, needed = np.shape(episodes[name]), (new, *array.shape[1:])
+            if shape != needed:
+                raise ValueError(f'episodes["{name}"] is {shape}, and must be {needed}')
         if new > self.capacity:
             raise ValueError(f"{new} episodes do not fit into a buffer of {self.capacity}")
         free = min(new, self.capacity - self.size)
@@ -91,11 +95,17 @@ def transitions(
     reward_fn: RewardFn,
 ) -> Batch:
     """The transitions t (B,) of the episodes e (B,) with the goals (B, G) and their rewards.
-    Returns what `relabel_future` returns."""
+    Returns what `relabel_future` returns, and raises its errors."""
     # r(s, a, g) asks whether the action led to the goal, so it reads the NEXT achieved goal.
     reward = np.asarray(reward_fn(episodes["achieved_goal"][e, t + 1], goal), dtype=np.float32)
+    if reward.shape != e.shape:
+        raise ValueError(
+            f"reward_fn of {goal.shape} goals gave {reward.shape}, not {e.shape} rewards"
+        )
     if not np.isfinite(reward).all():
         raise FloatingPointError("NaN or Inf in the rewards")
+    if reward.max(initial=-1) > 0 or reward.min(initial=0) < -1:
+        raise ValueError(f"reward_fn gave {reward.min()} to {reward.max()}, not Eq. (1)'s -1 and 0")
     return {
         "obs": episodes["obs"][e, t],
         "action": episodes["action"][e, t],
@@ -121,7 +131,8 @@ def relabel_future(
     reward_fn: Eq. (1), vectorised: (B, G) achieved and (B, G) desired goals -> (B,) of -1 and 0.
     Returns obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,) and hindsight (B,),
         a bool.
-    FloatingPointError for a reward that is NaN or Inf.
+    FloatingPointError for a reward that is NaN or Inf; ValueError for rewards of another shape or
+        beyond -1 and 0, by which `EnsembleDDPG` clips its targets.
     """
     n, horizon = episodes["action"].shape[:2]
     e = rng.integers(n, size=batch_size)

@@ -7,6 +7,7 @@ Where there is a formula, the expected value comes from a slow and obvious versi
 import copy
 import itertools
 import math
+import re
 import threading
 import timeit
 from decimal import Decimal, localcontext
@@ -244,6 +245,38 @@ def test_episode_buffer_fills_then_overwrites_random_episodes():
         EpisodeBuffer(capacity=49, horizon=50, obs_dim=2, goal_dim=2, action_dim=2)
 
 
+def test_episodes_of_other_shapes_are_refused_by_name():
+    buffer, episodes = EpisodeBuffer(200, 50, 2, 2, 2), numbered_episodes(3)
+    for name, wrong in (
+        ("obs", episodes["obs"][:, 1:]),
+        ("achieved_goal", episodes["achieved_goal"][0]),
+        ("desired_goal", episodes["desired_goal"][:, :1]),
+        ("action", episodes["action"][..., None]),
+        ("desired_goal", episodes["desired_goal"][:2]),
+    ):
+        with pytest.raises(ValueError, match=re.escape(f'episodes["{name}"] is {wrong.shape}')):
+            buffer.add({**episodes, name: wrong}, np.random.default_rng(0))
+    one = {name: x[0] for name, x in episodes.items()}  # without its first axis
+    with pytest.raises(ValueError, match=r"is \(51, 2\), and must be \(50, 51, 2\)"):
+        buffer.add(one, np.random.default_rng(0))
+    assert buffer.size == 0
+
+
+@pytest.mark.parametrize(
+    ("reward_fn", "error", "message"),
+    [
+        (lambda a, d: np.where(a[:, 0] > 2, np.nan, -1), FloatingPointError, "in the rewards"),
+        (lambda a, d: 1.0 * (a == d).all(axis=-1), ValueError, "reward_fn gave 0.0 to 1.0"),
+        (lambda a, d: -np.abs(a - d).sum(axis=-1), ValueError, "not Eq. \\(1\\)'s -1 and 0"),
+        (lambda a, d: -np.linalg.norm(a - d), ValueError, r"gave \(\), not \(500,\) rewards"),
+        (lambda a, d: -1.0 * (a != d), ValueError, r"of \(500, 2\) goals gave \(500, 2\)"),
+    ],
+)
+def test_rewards_that_are_not_eq_1_are_refused(reward_fn, error, message):
+    with pytest.raises(error, match=message):
+        relabel_future(numbered_episodes(), 500, np.random.default_rng(0), 0.8, reward_fn)
+
+
 @given(capacity=st.integers(1, 60), horizon=st.integers(1, 20), adds=st.lists(st.integers(1, 5)))
 def test_any_episode_buffer_holds_whole_episodes(capacity, horizon, adds):
     if capacity < horizon:
@@ -422,6 +455,9 @@ def test_the_ensemble_is_16_separate_networks():
         np.testing.assert_allclose(agent.value(obs, goal), np.stack(value), atol=1e-4)
         # only some heads
         alone = agent.act(batch["obs"][None], batch["goal"][None], slice(1))
+        for wrong in (batch["obs"][:16], obs[:2], obs[0], obs[None]):
+            with pytest.raises(ValueError, match=re.escape(f"obs is {wrong.shape}")):
+                agent.act(wrong, goal)
         np.testing.assert_allclose(alone[0], actors[0](state), atol=1e-5)
 
 
@@ -468,13 +504,13 @@ def test_updates_are_those_of_plain_ddpg(together):
     own targets, clipping, weights, gradients before steps, one Adam of the trunk for all heads. Of
     heads that step together the trunk's gradients are added up. The gradients themselves are
     compared too, as Adam's step hides their scale."""
-    agent = random_agent(heads=3, action_penalty=0.3)
+    agent = random_agent(heads=3, action_penalty=0.3, learning_rate=2e-3)
     actors, critics = plain_ensemble(agent.actor, True), plain_ensemble(agent.critic, False)
     target_actors = plain_ensemble(agent.target_actor, True)
     target_critics = plain_ensemble(agent.target_critic, False)
-    trunks = [torch.optim.Adam(nets[0].trunk.parameters()) for nets in (actors, critics)]
+    trunks = [torch.optim.Adam(nets[0].trunk.parameters(), 2e-3) for nets in (actors, critics)]
     heads = [
-        [torch.optim.Adam(nets[k].head.parameters()) for nets in (actors, critics)]
+        [torch.optim.Adam(nets[k].head.parameters(), 2e-3) for nets in (actors, critics)]
         for k in range(3)
     ]
     assert all(net.trunk is nets[0].trunk for nets in (actors, critics) for net in nets)
@@ -948,6 +984,7 @@ def test_exploration_noise():
     kept = (actions == 0.9).all(axis=1)
     assert abs(kept.mean() - 0.7) < 0.01
     assert np.all((actions != 0.9).any(axis=1) == ~kept)  # the whole action is replaced
+    assert len(np.unique(actions[~kept, 0])) == (~kept).sum()  # by one of its own
     np.testing.assert_allclose(np.quantile(actions[~kept], [0.25, 0.75]), [-0.5, 0.5], atol=0.02)
 
 
@@ -987,6 +1024,7 @@ def test_each_seed_and_epoch_has_random_numbers_of_its_own(tmp_path, monkeypatch
     assert len(resets) == len(set(resets)) == 2 * 2 * 2  # seeds, epochs, training and testing
     assert {name: len(set(used)) for name, used in streams.items()} == dict.fromkeys(streams, 4)
     assert len(set().union(*streams.values())) == 3 * 4
+    assert len(streams["exploring"]) == 2 * (3 + 2)  # the first epoch has one cycle more
 
 
 @pytest.mark.parametrize(

@@ -108,8 +108,8 @@ def planned(file: Path, given: argparse.Namespace) -> list[Config]:
 
 def check_environments(runs: list[Config]) -> None:
     """UsageError for an environment that cannot be learned in."""
-    for env in dict.fromkeys(config.env for config in runs):
-        make_env(env).close()
+    for env, length in dict.fromkeys((config.env, config.episode_length) for config in runs):
+        make_env(env, length).close()
 
 
 def hours_left(runs: list[Config]) -> str:

@@ -3,16 +3,17 @@
 import math
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-
-import gymnasium as gym
 
 from baselines import cher, dtgsh, herebp
 from baselines.her import HERReplay
 from ensemble import HIDDEN, EnsembleDDPG
 from harness import records, settings
+from harness.border import Border
 from harness.errors import UsageError
 from harness.gpu import EnsembleOnGPU, HERBufferOnGPU
 from harness.settings import Config
@@ -23,10 +24,26 @@ from vcp import HERBuffer
 
 
 def memory() -> int:
-    """The machine's memory in bytes; without a limit where it cannot be asked for."""
+    """The bytes that this process may take: the least of what the machine has, of a container's
+    limit (cgroup) and of what `ulimit -v` leaves; sys.maxsize where none can be asked for."""
+    limits = [sys.maxsize]
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return sys.maxsize
+        limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    with suppress(OSError, ValueError):  # no Linux, or no limit
+        group = Path("/proc/self/cgroup").read_text().splitlines()[-1].rpartition(":")[2]
+        folder = Path("/sys/fs/cgroup", group.lstrip("/"))
+        for place in (folder, *folder.parents):
+            for file in (place / "memory.max", place / "memory" / "memory.limit_in_bytes"):
+                with suppress(OSError, ValueError):
+                    limits.append(int(file.read_text()))
+    with suppress(ImportError, OSError, ValueError):
+        import resource
+
+        (limit, _), pages = resource.getrlimit(resource.RLIMIT_AS), 0
+        if limit != resource.RLIM_INFINITY:
+            pages = int(Path("/proc/self/statm").read_text().split()[0])
+            limits.append(limit - pages * resource.getpagesize())
+    return max(min(limits), 0)
 
 
 @dataclass
@@ -45,11 +62,16 @@ class Parts:
         """What a checkpoint keeps."""
         return self.agent, self.original_buffer, self.replay
 
-    def envs(self) -> ParallelEnvs:
-        """The environments, in their processes."""
+    @contextmanager
+    def envs(self) -> Iterator[ParallelEnvs]:
+        """The environments, in their processes. Afterwards the one of the task is closed too."""
         workers = whole_heads(self.config.num_workers, self.num_envs, self.config.heads)
         length = self.config.episode_length
-        return ParallelEnvs(self.config.env, self.num_envs, workers, episode_length=length)
+        with (
+            closing(self.task.env),
+            ParallelEnvs(self.config.env, self.num_envs, workers, episode_length=length) as envs,
+        ):
+            yield envs
 
 
 def memory_needed(config: Config, task: Task) -> int:
@@ -60,28 +82,40 @@ def memory_needed(config: Config, task: Task) -> int:
     networks = 9 * config.heads * of_a_head  # two, with targets and moments, and a copy of one
     scored = settings.scored_a_sweep(config) * config.heads
     hidden = 8 * HIDDEN * max(config.batch_size, scored)
-    b_o = 4 * config.buffer_size * (task.obs_dim + task.goal_dim + task.action_dim)
+    # B_o, and what is being collected, twice
+    steps = config.buffer_size + 2 * number_of_envs(config) * task.horizon
+    b_o = 4 * steps * (task.obs_dim + task.goal_dim + task.action_dim)
     return networks + hidden + b_o + row * ((config.her_buffer_capacity or 0) + config.batch_size)
+
+
+def number_of_envs(config: Config) -> int:
+    """One a head; fewer than 16 heads have several each, for the paper's amount of data."""
+    return config.heads * math.ceil(16 / config.heads)
+
+
+def refuse_what_does_not_fit(config: Config, task: Task) -> None:
+    """UsageError for sizes that the memory or B_o does not hold."""
+    if config.buffer_size < task.horizon:
+        raise UsageError(f"--buffer-size must be {task.horizon} or more, to hold an episode")
+    needed, there = memory_needed(config, task), memory()
+    if needed > there:
+        sizes = "--heads, --batch-size, --buffer-size or --episode-length"
+        amount = f"{needed / 2**30:.1f} GB are needed and {there / 2**30:.1f} are there"
+        raise UsageError(f"{amount}: lower {sizes}")
+    num_envs = number_of_envs(config)
+    if num_envs > config.buffer_size // task.horizon:
+        raise UsageError(f"--buffer-size must hold {num_envs} episodes of {task.horizon} steps")
 
 
 def assemble(config: Config) -> Parts:
     """All parts of a run, untrained. config: complete. UsageError for an environment that cannot be
-    learned in, and for sizes that the machine's memory does not hold."""
-    task = examine(config.env, config.episode_length)
-    needed, there = memory_needed(config, task), memory()
-    if needed > there:
-        sizes = "--heads, --batch-size, --buffer-size"
-        raise UsageError(f"{needed >> 30} GB are needed and {there >> 30} are there: lower {sizes}")
-    if config.buffer_size < task.horizon:
-        raise UsageError(f"--buffer-size must be {task.horizon} or more, to hold an episode")
-    # One environment a head; fewer than 16 heads have several each, for the paper's amount of data.
-    num_envs = config.heads * math.ceil(16 / config.heads)
+    learned in, and for sizes that the memory does not hold."""
+    task = examine(config.env, config.episode_length, partial(refuse_what_does_not_fit, config))
+    num_envs = number_of_envs(config)
     agent = make_agent(config, task)
     original_buffer = EpisodeBuffer(
         config.buffer_size, task.horizon, task.obs_dim, task.goal_dim, task.action_dim
     )
-    if num_envs > original_buffer.capacity:
-        raise UsageError(f"--buffer-size must hold {num_envs} episodes of {task.horizon} steps")
     replay = make_replay(config, task, original_buffer)
     her_buffer = replay if config.method == "vcp" else None
     return Parts(config, task, num_envs, agent, original_buffer, her_buffer, replay)
@@ -137,12 +171,16 @@ def restored(folder: Path) -> tuple[Parts, list[dict]]:
     config = replace(settings.load(folder), device="cpu", tensorboard=False)
     parts = assemble(settings.complete(config))
     rows = records.restore(folder, asdict(parts.config), parts.state())
+    if not rows and (epochs := records.epochs_done(folder)):
+        raise UsageError(
+            f"{folder} has {epochs} epochs in progress.csv and no {records.CHECKPOINT}"
+        )
     if not rows:
         raise UsageError(f"the run in {folder} has no whole epoch yet")
     return parts, rows
 
 
-def load(folder: str | Path, **kwargs) -> tuple[EnsembleDDPG, gym.Env]:
+def load(folder: str | Path, **kwargs) -> tuple[EnsembleDDPG, Border]:
     """The trained agent of the run in `folder`, and its environment; kwargs, such as render_mode,
     go to the latter. UsageError if there is none."""
     parts, _ = restored(Path(folder))

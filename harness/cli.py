@@ -15,7 +15,7 @@ from harness.errors import EnvironmentFailed, UsageError
 from harness.settings import Config
 
 ANIMATIONS = (".gif", ".webp", ".png")
-STOPS = (FloatingPointError, OSError, EnvironmentFailed, KeyboardInterrupt)  # no fault of run.py's
+STOPS = (FloatingPointError, OSError, MemoryError, EnvironmentFailed, KeyboardInterrupt)
 
 
 def main(train: Callable, argv: list[str] | None = None) -> None:
@@ -37,13 +37,19 @@ def main(train: Callable, argv: list[str] | None = None) -> None:
             saved = settings.load(Path(command.resume))
             config = settings.changed(saved, {**given, "out": command.resume})
         config = settings.complete(config)
+        folder = Path(config.out).absolute()  # an environment may change the working folder
         try:
             train(config, resume=command.resume is not None)
-        except STOPS as error:
-            stopped(Path(config.out), error)
-        folder = config.out
-        print(f"{folder}: curve.png, progress.csv; to see it: python run.py --play {folder}")
-    except UsageError as error:
+        except STOPS as error:  # no fault of run.py's
+            stopped(folder, error)
+        except RuntimeError as error:  # PyTorch's MemoryError
+            if "can't allocate memory" not in str(error):
+                raise
+            stopped(folder, MemoryError("the memory is full"))
+        print(
+            f"{config.out}: curve.png, progress.csv; to see it: {records.to_type('--play', folder)}"
+        )
+    except (UsageError, EnvironmentFailed) as error:
         fail(str(error))
     except KeyboardInterrupt:  # while it plays
         sys.exit(130)
@@ -55,7 +61,7 @@ def stopped(folder: Path, error: BaseException) -> NoReturn:
     done = records.epochs_done(folder)
     reason = f": {error}" if str(error) else ""
     saved = (folder / records.CHECKPOINT).exists()
-    way_on = f"; to go on: python run.py --resume {folder}" if saved else ""
+    way_on = f"; to go on: {records.to_type('--resume', folder)}" if saved else ""
     print(f"run.py: stopped in epoch {done + 1}{reason}{way_on}", file=sys.stderr)
     sys.exit(130 if isinstance(error, KeyboardInterrupt) else 1)
 

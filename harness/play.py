@@ -7,9 +7,11 @@ cannot run code. `--play FILE.npz` plays it.
 import json
 import os
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import torch
 from PIL import Image
@@ -18,9 +20,10 @@ from tqdm import tqdm
 from ensemble import EnsembleDDPG
 from harness import numerics
 from harness.assemble import restored
-from harness.errors import UsageError
-from harness.records import write_whole
-from harness.tasks import make_env, succeeded
+from harness.border import Border
+from harness.errors import EnvironmentFailed, UsageError
+from harness.records import to_type, write_whole
+from harness.tasks import make_env
 
 EPISODES = 10  # of each head
 SHOWN = 5  # of the best head
@@ -37,7 +40,11 @@ def play(source: Path, gif: str | None = None, policy: str | None = None) -> np.
     window where there is a display, or as the animation `gif`. Returns the success rate of each
     head, (K,). UsageError if nothing was learned yet, for a file that is no policy, and for
     pictures that cannot be drawn."""
+    source = source.absolute()  # an environment may change the working folder
+    gif, policy = (file and str(Path(file).absolute()) for file in (gif, policy))
     agent, about = read_policy(source) if source.is_file() else of_run(source)
+    if gif:
+        try_to_draw(about)
     env = make_env(about["env"], about["episode_length"])
     seeds = range(SEED, SEED + EPISODES)
     rates = np.zeros(agent.heads)
@@ -58,21 +65,39 @@ def play(source: Path, gif: str | None = None, policy: str | None = None) -> np.
     if gif or window:
         show(about, agent, best, seeds[:SHOWN], gif)
     elif not policy:
-        print(f"no display; for an animation: python run.py --play {source} --gif FILE.gif")
+        print(f"no display; for an animation: {to_type('--play', source)} --gif FILE.gif")
     return rates
+
+
+def try_to_draw(about: dict) -> None:
+    """Draw one picture, before all the episodes are played for it. Without a display MuJoCo asks a
+    GPU's driver (EGL), unless MUJOCO_GL says otherwise. UsageError if it cannot be drawn."""
+    if sys.platform == "linux" and "DISPLAY" not in os.environ:
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    with drawing(about, "rgb_array") as env:
+        env.reset(seed=SEED)
+        env.render()
+
+
+@contextmanager
+def drawing(about: dict, mode: str) -> Iterator[Border]:
+    """The environment, to be drawn in the block. UsageError where that fails: MuJoCo's renderers
+    raise many kinds of errors without a display or a driver."""
+    warnings.simplefilter("ignore", UserWarning)  # gymnasium's, of a mode that is not there
+    try:
+        with closing(make_env(about["env"], about["episode_length"], render_mode=mode)) as env:
+            yield env
+    except (EnvironmentFailed, UsageError) as error:
+        hint = "without a display, set MUJOCO_GL=egl (a GPU's driver) or osmesa (libosmesa6)"
+        raise UsageError(f"cannot draw {about['env']} ({error}); {hint}") from error
 
 
 def show(about: dict, agent: EnsembleDDPG, head: int, seeds: range, gif: str | None) -> None:
     """Episodes of a head as the animation `gif` or, without a name, in a window. UsageError where
     neither can be."""
-    try:
-        mode = "rgb_array" if gif else "human"
-        env = make_env(about["env"], about["episode_length"], render_mode=mode)
-        shown = [episode(env, agent, head, seed)[1] for seed in seeds]
-        env.close()
-    except Exception as error:  # MuJoCo's renderers raise many kinds without a display or a driver
-        hint = "without a display, set MUJOCO_GL=egl (a GPU's driver) or osmesa (libosmesa6)"
-        raise UsageError(f"cannot draw {about['env']} ({error}); {hint}") from error
+    mode = "rgb_array" if gif else "human"
+    with drawing(about, mode) as env:
+        shown = [episode(env, agent, head, seed, mode)[1] for seed in seeds]
     if gif:
         octree = Image.Quantize.FASTOCTREE  # keeps the colour of something as small as a goal
         frames = [Image.fromarray(frame) for frames in shown for frame in frames]
@@ -85,28 +110,28 @@ def show(about: dict, agent: EnsembleDDPG, head: int, seeds: range, gif: str | N
 
 
 def episode(
-    env: gym.Env, agent: EnsembleDDPG, head: int, seed: int
+    env: Border, agent: EnsembleDDPG, head: int, seed: int, mode: str | None = None
 ) -> tuple[bool, list[np.ndarray]]:
-    """An episode of one head, without noise: its success at the last step and, where the
-    environment draws any, a picture of each step, (height, width, 3) uint8. One that is looked at
-    ends when it has been at its goal for HELD steps."""
+    """An episode of one head, without noise: its success at the last step and, with the mode
+    "rgb_array", a picture of each step, (height, width, 3) uint8. One that is looked at, with this
+    mode or "human", ends when it has been at its goal for HELD steps."""
     obs, _ = env.reset(seed=seed)
     frames, held = [], 0
-    for t in range(env.spec.max_episode_steps):
-        if env.render_mode == "rgb_array":
+    for t in range(env.horizon):
+        if mode == "rgb_array":
             frames.append(env.render())
-        if env.render_mode == "human" and t == 0:
+        if mode == "human" and t == 0:
             hide_menu(env)
         rows = obs["observation"][None, None], obs["desired_goal"][None, None]
         action = agent.act(*rows, slice(head, head + 1))[0, 0]
-        obs, reward, _, _, info = env.step(action)
-        held = held + 1 if succeeded(reward, info) else 0
-        if env.render_mode and held == HELD:
+        obs, *_, info = env.step(action)
+        held = held + 1 if info["is_success"] else 0
+        if mode and held == HELD:
             break
     return held > 0, frames
 
 
-def hide_menu(env: gym.Env) -> None:
+def hide_menu(env: Border) -> None:
     """Take MuJoCo's list of keys off its window, as the key H does."""
     viewer = getattr(getattr(env.unwrapped, "mujoco_renderer", None), "viewer", None)
     if viewer is not None:

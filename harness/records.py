@@ -11,6 +11,7 @@ import json
 import math
 import os
 import platform
+import shlex
 import subprocess
 import time
 import zipfile
@@ -121,6 +122,12 @@ def variance_by_kind(agent, replay, most: int = 4096) -> dict[str, float]:
 
 
 # ------------------------------------------------------------------------------ the folder
+
+
+def to_type(option: str, folder: Path) -> str:
+    """A command that goes on with a run or plays it, from any folder."""
+    program = Path(__file__).parent.parent / "run.py"
+    return shlex.join(["python", str(program), option, str(folder)])
 
 
 def write_whole(path: Path, write) -> None:
@@ -262,6 +269,9 @@ def restore(folder: Path, config: dict, parts: tuple) -> list[dict]:
             ]
             if differ:
                 raise UsageError(f"{path} was made with another {differ[0]} than config.json says")
+            if _sizes(saved["parts"]) != _sizes([part.state_dict() for part in parts]):
+                changed = "networks or episodes of other sizes, as if the environment had changed"
+                raise UsageError(f"{path} has {changed}")
             for part, state in zip(parts, saved["parts"], strict=True):
                 part.load_state_dict(state)
             return saved["rows"]
@@ -272,6 +282,13 @@ def restore(folder: Path, config: dict, parts: tuple) -> list[dict]:
     if found:
         raise UsageError(f"no checkpoint in {folder} can be read: they are damaged")
     return []
+
+
+def _sizes(states: list[dict]) -> list:
+    """The shapes of an agent's tensors and of an episode of B_o."""
+    agent, original_buffer, *_ = states
+    shapes = [p.shape for network in agent["networks"] for p in network]
+    return shapes + [x.shape[1:] for x in original_buffer.values()]
 
 
 def _write_tensorboard(folder: Path, rows: list[dict]) -> None:

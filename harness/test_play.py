@@ -88,9 +88,9 @@ def test_what_is_looked_at_ends_at_the_goal_and_what_is_counted_does_not():
     towards = SimpleNamespace(act=lambda obs, goal, heads: np.clip(20 * (goal - obs), -1, 1))
     away = SimpleNamespace(act=lambda obs, goal, heads: np.clip(20 * (obs - goal), -1, 1))
     assert episode(env, towards, 0, seed=0) == (True, [])
-    success, frames = episode(shown, towards, 0, seed=0)
+    success, frames = episode(shown, towards, 0, 0, "rgb_array")
     assert success and 10 <= len(frames) < 40
-    success, frames = episode(shown, away, 0, seed=0)
+    success, frames = episode(shown, away, 0, 0, "rgb_array")
     assert not success and len(frames) == 50
 
 
@@ -105,7 +105,7 @@ def test_mujocos_window_comes_without_its_menu(monkeypatch):
     monkeypatch.setattr(PointMass, "render", lambda self: None)
     env = make_env("PointMassEmptyEnv-v1", render_mode="human")
     still = SimpleNamespace(act=lambda obs, goal, heads: 0 * obs)
-    episode(env, still, 0, seed=0)
+    episode(env, still, 0, 0, "human")
     assert hidden == [env]
 
 

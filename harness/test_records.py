@@ -22,6 +22,7 @@ from filelock import FileLock, Timeout
 import run
 from harness import records
 from harness.assemble import restored
+from harness.errors import EnvironmentFailed
 from harness.records import read_rows
 from harness.testing import ARGUMENTS, SMALL, assert_same_run, finish, main, start
 from run import Config
@@ -45,7 +46,7 @@ def test_a_resumed_run_of_a_robot_equals_an_uninterrupted_one(tmp_path):
     assert_same_run(tmp_path / "whole", tmp_path / "parts")
     assert not multiprocessing.active_children() and threading.active_count() == 1
     settings = {**settings, "env": "Broken-v0", "out": str(tmp_path / "broken")}
-    with pytest.raises(FloatingPointError):
+    with pytest.raises(EnvironmentFailed):
         run.train(Config(**settings))
     assert not multiprocessing.active_children() and threading.active_count() == 1
 
@@ -190,7 +191,7 @@ def test_a_flipped_bit_is_noticed(whole, tmp_path, capsys):
     [
         ("nan", "NaN|damaged"),
         ("parts", "damaged"),
-        ("size", "damaged"),
+        ("size", "has networks or episodes of other sizes"),
         ("foreign", "damaged"),
         ("pickle", "damaged"),
         ("config", "was made with another temperature than config.json says"),

@@ -99,13 +99,51 @@ class Tracker(gym.Env):
         }
 
 
-class Broken(envs_point.PointMass):
-    """Gives a NaN at step 7."""
+class Line(gym.Env):
+    """A point on a line, with nothing wrong: many tests change one thing each."""
+
+    tolerance, best, unit = 0.1, 0.0, 1  # the unit of what is observed
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, render_mode=None):
+        box = gym.spaces.Box(-2 * self.unit, 2 * self.unit, (1,), np.float64)
+        self.observation_space = gym.spaces.Dict(
+            observation=box, achieved_goal=box, desired_goal=box
+        )
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        far = np.abs(achieved_goal - desired_goal)[..., 0] > self.tolerance * self.unit
+        return self.best - far.astype(np.float32)
+
+    def observe(self):
+        x, g = self.unit * self.x, self.unit * self.g
+        return {"observation": x, "achieved_goal": x, "desired_goal": g}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        self.x, self.g = self.np_random.uniform(-1, 1, (2, 1))
+        return self.observe(), {}
 
     def step(self, action):
-        self.steps = getattr(self, "steps", 0) + 1
+        self.t += 1
+        self.x = np.clip(self.x + 0.2 * action, -1, 1)
+        obs = self.observe()
+        reward = float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {}))
+        return obs, reward, False, False, {"is_success": reward == self.best}
+
+
+class Broken(envs_point.PointMass):
+    """Gives a NaN at step 7 of an episode without a seed of its own, as those are that train."""
+
+    def reset(self, *, seed=None, options=None):
+        self.left = 7 if seed is None else -1
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        self.left -= 1
         obs, *rest = super().step(action)
-        if self.steps == 7:
+        if self.left == 0:
             obs["observation"][1] = math.nan
         return obs, *rest
 
@@ -147,17 +185,23 @@ SMALL = {
 ARGUMENTS = [f"{settings.flag(k)}={v}" for k, v in SMALL.items()]
 
 
-def start(*arguments, program=None, module=None, limit=None, cwd=None):
-    """run.py (or a program's text, or a module) in a process and session of its own, which Ctrl-C
-    reaches even if these tests run in the background; with a limit on the size of the files it may
-    write; in this folder or another."""
+def start(*arguments, program=None, module=None, script=None, limit=None, cwd=None):
+    """run.py (or a program's text, a module or a script) in a process and session of its own,
+    which Ctrl-C reaches even if these tests run in the background; with a limit on the size of the
+    files it may write; in this folder or another."""
 
     def prepare():
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         if limit:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    what = ["-c", program] if program else ["-m", module] if module else [str(HERE / "run.py")]
+    what = (
+        ["-c", program]
+        if program
+        else ["-m", module]
+        if module
+        else [str(script or HERE / "run.py")]
+    )
     return subprocess.Popen(
         [sys.executable, *what, *map(str, arguments)],
         stdout=subprocess.PIPE,

@@ -15,10 +15,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from harness.errors import EnvironmentFailed
-from harness.tasks import KEYS, disagreement, how_it_ended, make_env, succeeded
+from harness.border import KEYS, Border
+from harness.tasks import PAPER_ENVS, make_env
 
-MakeEnv = Callable[[], gym.Env]
+MakeEnv = Callable[[], Border]
 
 
 def available_cores() -> list[int]:
@@ -28,7 +28,7 @@ def available_cores() -> list[int]:
     return list(range(os.cpu_count()))
 
 
-def read_joints_by_index(env: gym.Env) -> gym.Env:
+def read_joints_by_index(env: Border) -> Border:
     """Make a Fetch or Hand environment find its joints once. gymnasium-robotics looks each of them
     up by name at each step, a quarter to almost half of the step's time; the values are the same.
     Other environments are left as they are."""
@@ -50,8 +50,7 @@ class EnvGroup(gym.Env):
     """Several environments as one: its observations and actions have a first axis over them.
 
     Nothing is reset by itself: episodes have a fixed length, and one that ends with success is
-    played on. EnvironmentFailed for one that ends otherwise, for a last step whose goal or reward
-    is not what replay will make of it, and for what an environment raises.
+    played on. EnvironmentFailed as in `Border`.
 
     main: the main process's id, for a group that lives in another; there Ctrl-C is ignored and, if
     `core` is given, that is the one processor that the process may use.
@@ -68,7 +67,6 @@ class EnvGroup(gym.Env):
             if core is not None:
                 os.sched_setaffinity(0, {core})
         self.envs = [read_joints_by_index(make()) for _ in range(1 if for_its_spaces else size)]
-        self.horizon, self.t = self.envs[0].spec.max_episode_steps, 0
         spaces = self.envs[0].observation_space
         self.observation_space = gym.spaces.Dict(
             {k: gym.spaces.Box(-np.inf, np.inf, (size, *spaces[k].shape), np.float32) for k in KEYS}
@@ -77,40 +75,21 @@ class EnvGroup(gym.Env):
         self.action_space = gym.spaces.Box(-1, 1, (size, *actions), np.float32)
 
     def reset(self, *, seed=None, options=None):
-        self.t = 0
         seeds = [None if seed is None else seed + i for i in range(len(self.envs))]
         pairs = zip(self.envs, seeds, strict=True)
-        observations = [self._ask(env.reset, seed=s)[0] for env, s in pairs]
-        self.goals = [obs["desired_goal"].copy() for obs in observations]
-        return self._stack(observations), {}
+        return self._stack([env.reset(seed=s)[0] for env, s in pairs]), {}
 
     def step(self, action):
-        self.t += 1
-        observations, success = [], []
-        for env, its_action, goal in zip(self.envs, action, self.goals, strict=True):
-            obs, reward, terminated, truncated, info = self._ask(env.step, its_action)
-            observations.append(obs)
-            success.append(succeeded(reward, info))
-            problem = how_it_ended(self.t, self.horizon, terminated, truncated, success[-1])
-            if self.t == self.horizon:
-                problem = self._ask(disagreement, env, self.t, goal, obs, reward)
-            if problem:
-                raise EnvironmentFailed(f"{env.spec.id}: {problem}")
-        return self._stack(observations), 0.0, False, False, {"is_success": np.array(success)}
+        stepped = [env.step(a) for env, a in zip(self.envs, action, strict=True)]
+        success = np.array([info["is_success"] for *_, info in stepped])
+        return self._stack([obs for obs, *_ in stepped]), 0.0, False, False, {"is_success": success}
 
     def close(self):
         for env in self.envs:
             env.close()
 
     def _stack(self, observations):
-        return {k: np.stack([obs[k] for obs in observations]).astype(np.float32) for k in KEYS}
-
-    def _ask(self, method, *args, **kwargs):
-        try:
-            return method(*args, **kwargs)
-        except Exception as error:
-            what = f"{method.__name__} raised {type(error).__name__}: {error}"
-            raise EnvironmentFailed(f"{self.envs[0].spec.id}: {what}") from error
+        return {k: np.stack([obs[k] for obs in observations]) for k in KEYS}
 
 
 class Worker:
@@ -182,10 +161,12 @@ class ParallelEnvs:
         pin = 1 < num_workers == len(cores) and hasattr(os, "sched_setaffinity")
         # gymnasium would print the traceback of what a worker raises; it is raised here as well.
         self._logged, gym.logger.min_level = gym.logger.min_level, 50
+        # A process that is not forked does not know what the user's own script has registered.
+        spec = gym.registry.get(PAPER_ENVS.get(name, name).rpartition(":")[2])
         self.workers = [
             Worker(
                 name,
-                partial(make_env, name, **settings),
+                partial(make_env, name, spec=spec, **settings),
                 slice(i * size, (i + 1) * size),
                 main=os.getpid() if num_workers > 1 else None,
                 core=cores[i] if pin else None,

@@ -1,0 +1,231 @@
+"""The border to an environment, which is somebody else's program: all of it is called here.
+
+`asked` makes one line of whatever it raises. `Border` hands out copies and takes copies in, looks
+at every observation, reward and success, and compares the rewards of an episode with those that
+replay will compute again.
+"""
+
+import random
+import sys
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box
+
+from harness.errors import EnvironmentFailed
+
+KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+def asked(name: str, method: str, function: Callable, *args, **kwargs) -> Any:
+    """function(*args, **kwargs), where it is code of the environment `name`. EnvironmentFailed, one
+    line, for whatever it raises; sys.exit() too, which would end the run without a word."""
+    try:
+        return function(*args, **kwargs)
+    except EnvironmentFailed:
+        raise
+    except (Exception, SystemExit) as error:
+        raise EnvironmentFailed(f"{name}: its {method} raised {said(error)}") from error
+
+
+def said(error: BaseException) -> str:
+    """An error in one line."""
+    message = " ".join(str(error).split()).rstrip(".")
+    return f"{type(error).__name__}: {message}".rstrip(": ")
+
+
+@cache
+def remark(text: str) -> None:
+    """A line on stderr, once in a process."""
+    print(f"run.py: {text}", file=sys.stderr)
+
+
+def picture(frame: Any) -> np.ndarray:
+    """What `render` gave, if it is a picture: (height, width, 3) uint8. ValueError if it is not."""
+    if not isinstance(frame, np.ndarray):
+        raise ValueError(f"no picture (height, width, 3) of uint8 but {type(frame)}")
+    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size:
+        raise ValueError(f"no picture (height, width, 3) of uint8 but {frame.shape} {frame.dtype}")
+    return frame
+
+
+class Border(gym.Wrapper):
+    """A goal environment as the rest of the project sees it.
+
+    Observations are float32 copies of their spaces' shapes, rewards are the -1 and 0 of Eq. (1),
+    info["is_success"] says whether the goal is reached: the environment's own word or, without one,
+    the reward's. An episode that ends at success is played on, as all have one length.
+    EnvironmentFailed, one line with the name and the method, for what is raised, and for what would
+    be learned wrongly without a word: other shapes or types, NaN and Inf, a goal that moves, an end
+    before the last step that is no success, and a reward that `compute_reward` does not give again
+    at the episode's end and after the next reset.
+    """
+
+    def __init__(self, env: gym.Env, name: str):
+        super().__init__(env)
+        self.name, self.horizon, self.t = name, env.spec.max_episode_steps, 0
+        self.shapes = {key: env.observation_space[key].shape for key in KEYS}
+        # The Pen tasks' compute_reward gives something else for a batch than for a pair, in
+        # gymnasium-robotics as in the gym of the paper (NOTES.md, "The Pen tasks' reward").
+        self.is_pen = getattr(env.unwrapped, "ignore_z_target_rotation", False)
+        self.episode = ([], [], [])  # desired and achieved goals of its steps, and their rewards
+        self.best = 0.0
+        self.best = self._best_reward()
+
+    def failed(self, problem: str) -> EnvironmentFailed:
+        return EnvironmentFailed(f"{self.name}: {problem}")
+
+    def _best_reward(self) -> float:
+        """Eq. (1)'s reward where the goal is reached: 0, or 1 where those of the environment are 0
+        and 1. It is asked for a goal that is reached and, twice, for another."""
+        obs, _ = self.reset()
+        achieved = np.stack([obs["achieved_goal"]] * 3)
+        desired = np.stack([obs["achieved_goal"], obs["desired_goal"], obs["desired_goal"]])
+        try:
+            rewards = np.asarray(self._asked_for(achieved, desired))
+        except EnvironmentFailed as error:
+            why = said(error.__cause__)
+            problem = f"its compute_reward does not take a batch of goals and no info ({why})"
+            raise self.failed(problem) from error
+        if rewards.shape != (3,):
+            problem = f"its compute_reward is not vectorised: 3 pairs of goals gave {rewards.shape}"
+            raise self.failed(problem)
+        if rewards[0] not in (0, 1) or not np.isin(rewards, (rewards[0] - 1, rewards[0])).all():
+            raise self.failed(
+                "its rewards are not the -1 and 0 (reached) of Eq. (1), nor 0 and 1,"
+                f" but {rewards[0]:g} for a goal that is reached and {rewards[1]:g} for another"
+            )
+        return float(rewards[0])
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """With a seed, Python's and NumPy's global generators get it too: some environments draw
+        from them, and processes that start alike would all draw the same."""
+        if seed is not None:
+            random.seed(seed)
+            np.random.seed(seed % 2**32)  # noqa: NPY002
+        return asked(self.name, "reset", self._reset, seed, options)
+
+    def _reset(self, seed, options):
+        obs, info = self.env.reset(seed=seed, options=options)
+        self.compare(self.episode)
+        self.t, self.episode = 0, ([], [], [])
+        taken = self._taken(obs)
+        self._goal = taken["desired_goal"].tobytes()
+        return taken, info
+
+    def step(self, action: np.ndarray):
+        return asked(self.name, "step", self._step, np.array(action))
+
+    def _step(self, action):
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self.t += 1
+        taken, reward = self._taken(obs), float(reward) - self.best
+        if reward not in (-1, 0):
+            raise self.failed(f"step {self.t} gave the reward {reward + self.best:g}")
+        success = info.get("is_success", reward == 0)
+        if success not in (0, 1):
+            raise self.failed(f"is_success of step {self.t} is {success!r}, not True or False")
+        if taken["desired_goal"].tobytes() != self._goal:
+            raise self.failed(
+                f"its goal moved in step {self.t}; it must stand still for an episode"
+            )
+        now = np.array(obs["desired_goal"]), np.array(obs["achieved_goal"]), reward
+        for numbers, x in zip(self.episode, now, strict=True):
+            numbers.append(x)
+        if self.t >= self.horizon:
+            self.compare(self.episode)
+        elif truncated:
+            cut = f"it cut an episode off after {self.t} of {self.horizon} steps"
+            raise self.failed(f"{cut}; try --episode-length {self.t}")
+        elif terminated and not success:
+            ended = f"an episode ended in step {self.t} of {self.horizon} without success"
+            raise self.failed(f"{ended}; episodes here have one length")
+        return taken, reward, terminated, truncated, {**info, "is_success": bool(success)}
+
+    def _taken(self, obs: dict) -> dict[str, np.ndarray]:
+        """Copies, as B_o stores them."""
+        with np.errstate(over="ignore"):  # to Inf
+            taken = {key: np.array(obs[key], dtype=np.float32) for key in KEYS}
+        for key, x in taken.items():
+            if x.shape != self.shapes[key]:
+                now = f"its {key} is {x.shape} after step {self.t}"
+                raise self.failed(f"{now}, its space says {self.shapes[key]}")
+            if not np.isfinite(x).all():
+                raise self.failed(f"NaN or Inf in its {key} after step {self.t}")
+        return taken
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info=None) -> np.ndarray:
+        """Eq. (1) of many pairs of goals, (B, G) and (B, G) -> (B,) of -1 and 0."""
+        rewards = np.asarray(self._asked_for(achieved, desired)) - self.best
+        if rewards.shape != achieved.shape[:-1]:
+            problem = f"its compute_reward of {achieved.shape} goals gave {rewards.shape} rewards"
+            raise self.failed(problem)
+        other = rewards[(rewards != 0) & (rewards != -1)]  # NaN too
+        if other.size:
+            raise self.failed(f"its compute_reward gave {other[0] + self.best:g}")
+        return rewards
+
+    def _asked_for(self, achieved, desired):
+        compute_reward = self.env.get_wrapper_attr("compute_reward")
+        goals = np.array(achieved), np.array(desired)  # which it may change
+        return asked(self.name, "compute_reward", compute_reward, *goals, {})
+
+    def compare(self, episode: tuple[list, list, list], dtype=None) -> None:
+        """Compute the rewards of an `episode` again, from its goals as they were or as `dtype`.
+        EnvironmentFailed if one is not the step's."""
+        desired, achieved = (np.array(goals, dtype) for goals in episode[:2])
+        if self.is_pen or not len(desired):
+            return
+        again = self.compute_reward(achieved, desired)
+        for t in np.flatnonzero(again != episode[2])[:1]:
+            given, now = episode[2][t] + self.best, again[t] + self.best
+            raise self.failed(
+                f"step {t + 1} gave the reward {given:g}, and compute_reward of what it observed"
+                f" gives {now:g} (it may depend on the goals alone; a wrapper that changes either"
+                " needs a compute_reward of its own)"
+            )
+
+    def render(self) -> np.ndarray | None:
+        """A picture (height, width, 3) uint8 or, in a window, None."""
+        if self.render_mode == "human":
+            return asked(self.name, "render", self.env.render)
+        return asked(self.name, "render", lambda: picture(self.env.render()))
+
+    def close(self) -> None:
+        """What it raises is said on stderr, and changes nothing: all has been done by then."""
+        try:
+            asked(self.name, "close", self.env.close)
+        except EnvironmentFailed as error:
+            remark(str(error))
+
+
+def what_is_missing(env: gym.Env) -> str | None:
+    """Why nothing can be learned in an environment with such spaces; None if it can."""
+    space, action = env.observation_space, env.action_space
+    if not (isinstance(space, gym.spaces.Dict) and set(KEYS) <= set(space.keys())):
+        return f"it has no goals (its observation is not a dict of {', '.join(KEYS)})"
+    if not all(isinstance(space[k], Box) and len(space[k].shape) == 1 for k in KEYS):
+        return f"its {', '.join(KEYS)} are not all flat Boxes"
+    if space["achieved_goal"].shape != space["desired_goal"].shape:
+        return "its achieved_goal and desired_goal differ in size"
+    if not (isinstance(action, Box) and len(action.shape) == 1 and action.shape[0]):
+        return f"its action space is {action}, not a flat Box"
+    if not np.issubdtype(action.dtype, np.floating):
+        return f"its actions are whole numbers ({action}), not real ones"
+    if not action.is_bounded():
+        return f"its actions have no bounds ({action})"
+    if not (action.low < action.high).all():
+        return f"its actions have no width ({action})"
+    with np.errstate(over="ignore"):
+        if not np.isfinite(np.float32(action.high) - np.float32(action.low)).all():
+            return f"its actions' bounds are too far apart for float32 ({action})"
+    if env.spec.max_episode_steps is None:
+        return "it has no episode length; give one, such as --episode-length 50"
+    if not (
+        env.has_wrapper_attr("compute_reward") and callable(env.get_wrapper_attr("compute_reward"))
+    ):
+        return "it has no compute_reward(achieved_goal, desired_goal, info)"
+    return None
