@@ -45,13 +45,13 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     where NaN or Inf turns up.
     """
     config = complete(config)
-    folder, began = Path(config.out).absolute(), time.perf_counter()  # an environment may chdir
+    folder = Path(config.out).absolute()  # an environment may change the working folder
     its = assemble(config)  # 1: the off-policy algorithm 𝔸, B_o and B_h
     agent, original_buffer, her_buffer = its.agent, its.original_buffer, its.her_buffer
     heads, num_envs, horizon = config.heads, its.num_envs, its.task.horizon
     acting = heads if config.acting_head == "all" else 1  # Section 5.6
     noise_shape, steps = (horizon, num_envs, its.task.action_dim), num_envs * horizon
-    test_rounds = math.ceil(config.eval_episodes / num_envs)
+    test_rounds, began = math.ceil(config.eval_episodes / num_envs), time.perf_counter()
     with (
         its.envs() as envs,
         records.held(folder, asdict(config), its.state(), resume) as rows,

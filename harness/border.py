@@ -68,10 +68,12 @@ class Border(gym.Wrapper):
         super().__init__(env)
         self.name, self.horizon, self.t = name, env.spec.max_episode_steps, 0
         self.shapes = {key: env.observation_space[key].shape for key in KEYS}
+        ends = np.cumsum([0, *(shape[0] for shape in self.shapes.values())])
+        self.places = {key: slice(*ends[i : i + 2]) for i, key in enumerate(KEYS)}
         # The Pen tasks' compute_reward gives something else for a batch than for a pair, in
         # gymnasium-robotics as in the gym of the paper (NOTES.md, "The Pen tasks' reward").
         self.is_pen = getattr(env.unwrapped, "ignore_z_target_rotation", False)
-        self.episode = ([], [], [])  # desired and achieved goals of its steps, and their rewards
+        self.episode = ([], [], [])  # its goal, what was achieved in each step, the rewards
         self.best = 0.0
         self.best = self._best_reward()
 
@@ -111,8 +113,9 @@ class Border(gym.Wrapper):
     def _reset(self, seed, options):
         obs, info = self.env.reset(seed=seed, options=options)
         self.compare(self.episode)
-        self.t, self.episode = 0, ([], [], [])
+        self.t = 0
         taken = self._taken(obs)
+        self.episode = (np.array(obs["desired_goal"]), [], [])
         self._goal = taken["desired_goal"].tobytes()
         return taken, info
 
@@ -132,9 +135,9 @@ class Border(gym.Wrapper):
             raise self.failed(
                 f"its goal moved in step {self.t}; it must stand still for an episode"
             )
-        now = np.array(obs["desired_goal"]), np.array(obs["achieved_goal"]), reward
-        for numbers, x in zip(self.episode, now, strict=True):
-            numbers.append(x)
+        _, achieved, rewards = self.episode
+        achieved.append(np.array(obs["achieved_goal"]))
+        rewards.append(reward)
         if self.t >= self.horizon:
             self.compare(self.episode)
         elif truncated:
@@ -147,15 +150,19 @@ class Border(gym.Wrapper):
 
     def _taken(self, obs: dict) -> dict[str, np.ndarray]:
         """Copies, as B_o stores them."""
-        with np.errstate(over="ignore"):  # to Inf
-            taken = {key: np.array(obs[key], dtype=np.float32) for key in KEYS}
-        for key, x in taken.items():
-            if x.shape != self.shapes[key]:
-                now = f"its {key} is {x.shape} after step {self.t}"
-                raise self.failed(f"{now}, its space says {self.shapes[key]}")
-            if not np.isfinite(x).all():
-                raise self.failed(f"NaN or Inf in its {key} after step {self.t}")
-        return taken
+        for key, shape in self.shapes.items():
+            if np.shape(obs[key]) != shape:
+                now = f"its {key} is {np.shape(obs[key])} after step {self.t}"
+                raise self.failed(f"{now}, its space says {shape}")
+        parts = [obs[key] for key in KEYS]
+        numbers = np.concatenate(parts, dtype=np.float64, casting="unsafe")
+        if not np.abs(numbers).max() < 1e38:  # NaN, Inf, and what float32 does not hold
+            key = next(
+                key for key, x in zip(KEYS, parts, strict=True) if not np.max(np.abs(x)) < 1e38
+            )
+            raise self.failed(f"NaN or Inf in its {key} after step {self.t}")
+        numbers = numbers.astype(np.float32)
+        return {key: numbers[where] for key, where in self.places.items()}
 
     def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info=None) -> np.ndarray:
         """Eq. (1) of many pairs of goals, (B, G) and (B, G) -> (B,) of -1 and 0."""
@@ -173,15 +180,17 @@ class Border(gym.Wrapper):
         goals = np.array(achieved), np.array(desired)  # which it may change
         return asked(self.name, "compute_reward", compute_reward, *goals, {})
 
-    def compare(self, episode: tuple[list, list, list], dtype=None) -> None:
+    def compare(self, episode: tuple, dtype=None) -> None:
         """Compute the rewards of an `episode` again, from its goals as they were or as `dtype`.
         EnvironmentFailed if one is not the step's."""
-        desired, achieved = (np.array(goals, dtype) for goals in episode[:2])
-        if self.is_pen or not len(desired):
+        goal, achieved, rewards = episode
+        if self.is_pen or not rewards:
             return
+        achieved = np.array(achieved, dtype)
+        desired = np.broadcast_to(np.asarray(goal, dtype), achieved.shape)
         again = self.compute_reward(achieved, desired)
-        for t in np.flatnonzero(again != episode[2])[:1]:
-            given, now = episode[2][t] + self.best, again[t] + self.best
+        for t in np.flatnonzero(again != rewards)[:1]:
+            given, now = rewards[t] + self.best, again[t] + self.best
             raise self.failed(
                 f"step {t + 1} gave the reward {given:g}, and compute_reward of what it observed"
                 f" gives {now:g} (it may depend on the goals alone; a wrapper that changes either"

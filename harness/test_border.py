@@ -223,7 +223,7 @@ REFUSED = {  # before anything is written
     odd("StopsIteration", step=raising(StopIteration())): "its step raised StopIteration",
     odd("OutOfMemory", step=raising(MemoryError())): "its step raised MemoryError",
     odd("Asserts", step=raising(AssertionError())): "its step raised AssertionError",
-    odd("Endless", 10**9): "--buffer-size must be 1000000000 or more",
+    odd("Lasting", 10**9): "--buffer-size must be 1000000000 or more",
 }
 
 STOPPED = {  # once training has begun

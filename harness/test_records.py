@@ -4,6 +4,7 @@ A killed and resumed run must end like one that was never stopped: the same rows
 aside, and the same weights.
 """
 
+import itertools
 import multiprocessing
 import os
 import random
@@ -14,7 +15,9 @@ import threading
 import time
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from filelock import FileLock, Timeout
@@ -49,6 +52,27 @@ def test_a_resumed_run_of_a_robot_equals_an_uninterrupted_one(tmp_path):
     with pytest.raises(EnvironmentFailed):
         run.train(Config(**settings))
     assert not multiprocessing.active_children() and threading.active_count() == 1
+
+
+def test_the_variances_are_of_a_part_of_what_is_stored():
+    """Of every tenth of 1,000 stored rows, each kind by itself; not of rows that hold nothing."""
+    rows = np.arange(2000.0)[:, None]
+    data = {"obs": rows, "action": rows, "goal": rows, "hindsight": rows[:, 0] % 20 == 0}
+    seen = []
+    agent = SimpleNamespace(q_variance=lambda obs, *_: (seen.append(obs), obs[:, 0])[1])
+    variance = records.variance_by_kind(agent, SimpleNamespace(data=data, size=1000), most=100)
+    np.testing.assert_array_equal(seen[0][:, 0], np.arange(0, 1000, 10))
+    assert variance == {"variance_hindsight": 490, "variance_original": 500}
+
+
+def test_the_seconds_of_an_epoch_are_added_up(monkeypatch):
+    clock = itertools.count(step=3)
+    monkeypatch.setattr(records.time, "perf_counter", lambda: next(clock))
+    notes = records.Notes(1, 1, 1)
+    for name in ("train", "eval", "train"):
+        with notes.timed(name):
+            pass
+    assert notes.seconds == {"train": 6, "eval": 3}
 
 
 def test_resuming_from_the_command_line(whole, tmp_path, capsys):

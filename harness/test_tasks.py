@@ -25,6 +25,7 @@ def test_the_papers_names():
     assert make_env("HandManipulateEggFull-v1").spec.max_episode_steps == 100  # its own length
     assert make_env("HandManipulateEggFull-v0").spec.max_episode_steps == 50  # the paper's
     assert "HandReach-v3" in examine("HandReach-v0").made
+    assert (examine("HandReach-v0").dt, examine("Tracker-v0").dt) == (0.04, 1)  # or unknown
 
 
 class Unlearnable(Tracker):
@@ -357,9 +358,10 @@ def test_without_is_success_the_reward_says_what_succeeded():
 def test_the_episode_length_can_be_given(tmp_path):
     assert examine("NoLength-v0", 7).horizon == 7 and examine("FetchReach-v1", 20).horizon == 20
     assert examine("HasAClock-v0", 5).horizon == 5  # its own clock's last step is no early end
-    settings = {**SMALL_TRAINING, "num_workers": 1, "out": str(tmp_path / "run")}
-    (row,) = train(Config(**settings, env="NoLength-v0", episode_length=7))
-    assert row["env_steps"] == 3 * 16 * 7
+    for name, length in (("NoLength-v0", 7), ("HasAClock-v0", 5)):
+        settings = {**SMALL_TRAINING, "num_workers": 1, "out": str(tmp_path / name)}
+        (row,) = train(Config(**settings, env=name, episode_length=length))
+        assert row["env_steps"] == 3 * 16 * length
 
 
 @pytest.mark.parametrize("workers", [1, 2])
