@@ -211,30 +211,32 @@ class Border(gym.Wrapper):
             remark(str(error))
 
 
-def what_is_missing(env: gym.Env) -> str | None:
-    """Why nothing can be learned in an environment with such spaces; None if it can."""
+def refuse_spaces(env: gym.Env, name: str) -> None:
+    """EnvironmentFailed for an environment with whose spaces nothing can be learned."""
     space, action = env.observation_space, env.action_space
-    if not (isinstance(space, gym.spaces.Dict) and set(KEYS) <= set(space.keys())):
-        return f"it has no goals (its observation is not a dict of {', '.join(KEYS)})"
-    if not all(isinstance(space[k], Box) and len(space[k].shape) == 1 for k in KEYS):
-        return f"its {', '.join(KEYS)} are not all flat Boxes"
-    if space["achieved_goal"].shape != space["desired_goal"].shape:
-        return "its achieved_goal and desired_goal differ in size"
-    if not (isinstance(action, Box) and len(action.shape) == 1 and action.shape[0]):
-        return f"its action space is {action}, not a flat Box"
-    if not np.issubdtype(action.dtype, np.floating):
-        return f"its actions are whole numbers ({action}), not real ones"
-    if not action.is_bounded():
-        return f"its actions have no bounds ({action})"
-    if not (action.low < action.high).all():
-        return f"its actions have no width ({action})"
+
+    def refuse(problem: str, wrong: bool) -> None:
+        if wrong:
+            raise EnvironmentFailed(f"{name}: {problem}")
+
+    keys = ", ".join(KEYS)
+    goals = isinstance(space, gym.spaces.Dict) and set(KEYS) <= set(space.keys())
+    refuse(f"it has no goals (its observation is not a dict of {keys})", not goals)
+    flat = all(isinstance(space[k], Box) and len(space[k].shape) == 1 for k in KEYS)
+    refuse(f"its {keys} are not all flat Boxes", not flat)
+    same = space["achieved_goal"].shape == space["desired_goal"].shape
+    refuse("its achieved_goal and desired_goal differ in size", not same)
+    flat = isinstance(action, Box) and len(action.shape) == 1 and action.shape[0]
+    refuse(f"its action space is {action}, not a flat Box", not flat)
+    whole = not np.issubdtype(action.dtype, np.floating)
+    refuse(f"its actions are whole numbers ({action}), not real ones", whole)
+    refuse(f"its actions have no bounds ({action})", not action.is_bounded())
+    refuse(f"its actions have no width ({action})", not (action.low < action.high).all())
     with np.errstate(over="ignore"):
-        if not np.isfinite(np.float32(action.high) - np.float32(action.low)).all():
-            return f"its actions' bounds are too far apart for float32 ({action})"
-    if env.spec.max_episode_steps is None:
-        return "it has no episode length; give one, such as --episode-length 50"
-    if not (
-        env.has_wrapper_attr("compute_reward") and callable(env.get_wrapper_attr("compute_reward"))
-    ):
-        return "it has no compute_reward(achieved_goal, desired_goal, info)"
-    return None
+        width = np.float32(action.high) - np.float32(action.low)
+    far = f"its actions' bounds are too far apart for float32 ({action})"
+    refuse(far, not np.isfinite(width).all())
+    length = "it has no episode length; give one, such as --episode-length 50"
+    refuse(length, env.spec.max_episode_steps is None)
+    named = env.has_wrapper_attr("compute_reward") and env.get_wrapper_attr("compute_reward")
+    refuse("it has no compute_reward(achieved_goal, desired_goal, info)", not callable(named))

@@ -1,11 +1,11 @@
 """The tasks: the paper's sixteen names (Appendix A), and any other goal environment."""
 
-import contextlib
 import difflib
 import io
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, redirect_stderr
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 
@@ -13,13 +13,13 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from harness.border import Border, asked, remark, said, what_is_missing
+from harness.border import Border, asked, refuse_spaces, remark, said
 from harness.errors import EnvironmentFailed, UsageError
 from her import RewardFn
 
 try:
     # they print a notice about other environments
-    with contextlib.redirect_stderr(io.StringIO()):
+    with redirect_stderr(io.StringIO()):
         import gymnasium_robotics
 
         import envs_point
@@ -97,32 +97,31 @@ def make_env(
     try:
         env = asked(name, "constructor", gym.make, made, **how)
     except EnvironmentFailed as error:
-        raise UsageError(
-            f"cannot make the environment {name}: {_why_not_made(name, error)}"
-        ) from error
-    try:
-        if problem := asked(name, "spaces", what_is_missing, env):
-            raise UsageError(f"cannot learn in the environment {name}: {problem}")
+        raise UsageError(f"cannot make the environment {name}: {_why(name, error)}") from error
+    with before_training():
+        asked(name, "spaces", refuse_spaces, env, name)
         if not (np.all(env.action_space.low == -1) and np.all(env.action_space.high == 1)):
             env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
         return Border(env, name)
+
+
+@contextmanager
+def before_training() -> Iterator[None]:
+    """What an environment does wrong in the block is bad input."""
+    try:
+        yield
     except EnvironmentFailed as error:
-        raise _cannot_learn(name, error) from error
+        raise UsageError(f"cannot learn in the environment {error}") from error
 
 
-def _cannot_learn(name: str, error: EnvironmentFailed) -> UsageError:
-    problem = str(error).removeprefix(f"{MISSPELT.get(name, name)}: ")
-    return UsageError(f"cannot learn in the environment {name}: {problem}")
-
-
-def _why_not_made(name: str, error: EnvironmentFailed) -> str:
-    """In one line, with the names that are nearest, or the module that was looked into."""
+def _why(name: str, error: EnvironmentFailed) -> str:
+    """Why an environment was not made, with the names that are nearest, or the module that was
+    looked into."""
     cause = error.__cause__
     if not isinstance(cause, (gym.error.Error, ModuleNotFoundError)):
-        return str(error).removeprefix(f"{name}: ")
-    message = " ".join(str(cause).split()).rstrip(".")
-    module = sys.modules.get(name.rpartition(":")[0])
-    if module is not None:
+        return f"its constructor raised {said(cause)}"
+    message = said(cause).partition(": ")[2]
+    if module := sys.modules.get(name.rpartition(":")[0]):
         return f"{message}; the module is {module.__file__}: if that is not yours, rename yours"
     ids = [i for i, spec in gym.registry.items() if "obotics" in str(spec.entry_point)]
     close = difflib.get_close_matches(name, {*PAPER_ENVS, *ids}, n=3, cutoff=0.5)
@@ -152,21 +151,14 @@ def examine(
         reward_fn=env.compute_reward,
         env=env,
     )
-    try:
+    with ExitStack() as unless_all_is_well, before_training():
+        unless_all_is_well.callback(env.close)
         fits(task)
         rows, seeded = _played(env)
         _look_at_the_scale(task, rows)
-    except EnvironmentFailed as error:
-        env.close()
-        raise _cannot_learn(name, error) from error
-    except UsageError:
-        env.close()
-        raise
-    return (
-        task
-        if seeded
-        else replace(task, made=f"{task.made}; it does not follow its seed, so that runs differ")
-    )
+        unless_all_is_well.pop_all()
+    unseeded = "" if seeded else "; it does not follow its seed, so that runs differ"
+    return replace(task, made=task.made + unseeded)
 
 
 def _played(env: Border) -> tuple[list[dict], bool]:
@@ -196,32 +188,27 @@ def _played(env: Border) -> tuple[list[dict], bool]:
 
 
 def _look_at_the_scale(task: Task, rows: list[dict]) -> None:
-    """UsageError for goals that the networks cannot tell apart, a line for such observations. The
-    paper's own tasks, which have some numbers that hardly move, are known to be learned."""
+    """EnvironmentFailed for goals that the networks cannot tell apart, a line for such
+    observations. The paper's own tasks, in which some numbers hardly move, are learned."""
     goals = np.array([row[key] for row in rows for key in ("achieved_goal", "desired_goal")])
-    beyond = np.flatnonzero((np.abs(goals) > CLIP).any(axis=0))
-    other_units = "to the networks: use other units"
-    if beyond.size:
-        problem = f"its goals lie beyond ±{CLIP} (number {beyond[0]}), all the same {other_units}"
-        raise UsageError(f"cannot learn in the environment {task.name}: {problem}")
-    spread = goals.std(axis=0, dtype=np.float64)
+    beyond, spread = np.abs(goals).max(axis=0) > CLIP, np.std(goals, axis=0, dtype=np.float64)
+    if beyond.any():
+        where = f"lie beyond ±{CLIP} (number {beyond.argmax()})"
+        raise task.env.failed(f"its goals {where}, all the same to the networks: use other units")
     if 0 < spread.max() < FLOOR:
-        problem = f"its goals differ by {spread.max():.1g} at most, next to nothing {other_units}"
-        raise UsageError(f"cannot learn in the environment {task.name}: {problem}")
-    if PAPER_ENVS.get(task.name, task.name) in PAPER_ENVS.values() or task.name in MISSPELT:
+        where = f"differ by {spread.max():.1g} at most"
+        raise task.env.failed(f"its goals {where}, which the networks hardly see: use other units")
+    if task.env.unwrapped.spec.id in PAPER_ENVS.values():
         return
     obs = np.array([row["observation"] for row in rows], dtype=np.float64)
     moves = np.ptp(obs, axis=0) > 0
     clipped = moves & (np.ptp(obs.clip(-CLIP, CLIP), axis=0) == 0)
     small = moves & (obs.std(axis=0) < FLOOR)
     for which, how in ((clipped, f"only beyond ±{CLIP}"), (small, f"by less than {FLOOR}")):
-        numbers = np.flatnonzero(which).tolist()
-        if numbers:
-            some = ", ".join(map(str, numbers[:5])) + (", ..." if len(numbers) > 5 else "")
-            remark(
-                f"{task.name}: number {some} of its observation moves {how}, which the networks"
-                " hardly see: use other units if it matters"
-            )
+        if which.any():
+            numbers = ", ".join(map(str, np.flatnonzero(which)))
+            moving = f"number {numbers} of its observation moves {how}"
+            remark(f"{task.name}: {moving}, which the networks hardly see")
 
 
 def _describe(name: str, env: Border) -> str:

@@ -97,6 +97,8 @@ def test_it_acts_with_the_actors_as_they_are(device, tmp_path):
     assert all(abs(x - y).max() > 1e-4 for x, y in itertools.pairwise(acted))
     agent.load_state_dict(torch.load(tmp_path / "saved.pt", map_location="cpu"))
     check()
+    agent.load_state_dict(EnsembleOnGPU(**SIZES, device=device, seed=1).state_dict())
+    check()  # one that has seen and learned nothing
 
 
 @pytest.mark.parametrize("device", DEVICES)

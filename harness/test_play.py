@@ -1,5 +1,6 @@
 """Tests of playing a run, and of policies."""
 
+import itertools
 import json
 import shutil
 from types import SimpleNamespace
@@ -61,6 +62,16 @@ def test_a_policy_acts_as_the_best_head_and_plays_without_the_run(
     assert "over 10 episodes" in out and f"--play {file} --gif" in out and "by head" not in out
 
 
+def test_the_best_head_is_the_one_that_is_kept(whole, tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr(module, "episode", lambda env, agent, head, seed: (head == 1, []))
+    assert play(whole, policy=str(tmp_path / "policy.npz")).tolist() == [0, 1]
+    assert "the best is 1" in capsys.readouterr().out
+    (agent, _), (its, _) = module.of_run(whole), read_policy(tmp_path / "policy.npz")
+    for ours, theirs in zip(its.actor.own[0], agent.actor.own[1], strict=True):
+        assert torch.equal(ours, theirs)
+
+
 def test_a_damaged_policy_or_one_of_another_task_is_refused(whole, tmp_path):
     file = tmp_path / "policy.npz"
     module.write_policy(file, *module.of_run(whole)[:1], 0, {"env": "x", "episode_length": None})
@@ -85,9 +96,17 @@ def test_a_damaged_policy_or_one_of_another_task_is_refused(whole, tmp_path):
 def test_what_is_looked_at_ends_at_the_goal_and_what_is_counted_does_not():
     env = make_env("PointMassEmptyEnv-v1")
     shown = make_env("PointMassEmptyEnv-v1", render_mode="rgb_array")
+    heads, steps = [], itertools.count()
     towards = SimpleNamespace(act=lambda obs, goal, heads: np.clip(20 * (goal - obs), -1, 1))
+
+    def there_and_back(obs, goal, its):
+        heads.append(its)
+        return towards.act(obs, goal, its) if next(steps) < 30 else -np.sign(goal)
+
     away = SimpleNamespace(act=lambda obs, goal, heads: np.clip(20 * (obs - goal), -1, 1))
     assert episode(env, towards, 0, seed=0) == (True, [])
+    assert episode(env, SimpleNamespace(act=there_and_back), 3, seed=0) == (False, [])
+    assert heads == 50 * [slice(3, 4)]
     success, frames = episode(shown, towards, 0, 0, "rgb_array")
     assert success and 10 <= len(frames) < 40
     success, frames = episode(shown, away, 0, 0, "rgb_array")
