@@ -9,7 +9,7 @@ prioritisation is in vcp.py.
 """
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -38,7 +38,7 @@ class MultiHeadMLP:
     squash: applied to the output; torch.tanh for the actor, None for the critic.
     """
 
-    def __init__(self, inputs, outputs, heads, generator, device="cpu", squash=None):
+    def __init__(self, inputs, outputs, num_heads, generator, device="cpu", squash=None):
         def xavier(*shape):  # U(-√(6/(I+J)), √(6/(I+J)))
             bound = (6 / (shape[-1] + shape[-2])) ** 0.5
             return torch.empty(shape).uniform_(-bound, bound, generator=generator).to(device)
@@ -48,10 +48,10 @@ class MultiHeadMLP:
 
         self.squash = squash or (lambda x: x)
         self.trunk = [xavier(HIDDEN, inputs), zeros(HIDDEN), xavier(HIDDEN, HIDDEN), zeros(HIDDEN)]
-        self.heads = [xavier(heads, HIDDEN, HIDDEN), zeros(heads, HIDDEN)]  # stacked, (K, ...)
-        self.heads += [xavier(heads, outputs, HIDDEN), zeros(heads, outputs)]
+        self.stacks = [xavier(num_heads, HIDDEN, HIDDEN), zeros(num_heads, HIDDEN)]  # (K, ...)
+        self.stacks += [xavier(num_heads, outputs, HIDDEN), zeros(num_heads, outputs)]
         # Head k's own four tensors: views into the stacks, so training it changes its slice alone.
-        self.own = [[p[k] for p in self.heads] for k in range(heads)]
+        self.own = [[p[k] for p in self.stacks] for k in range(num_heads)]
 
     def parameters(self) -> list[torch.Tensor]:
         """The trunk's four tensors, then four of each head."""
@@ -70,7 +70,7 @@ class MultiHeadMLP:
     def all_heads(self, x: torch.Tensor, heads: slice = slice(None)) -> torch.Tensor:
         """The chosen heads in one call. x is (K, E, I), rows of their own for each head, or (B, I),
         the same rows for all; returns (K, E, J) or (K, B, J)."""
-        return self._forward([*self.trunk, *(p[heads] for p in self.heads)], x)
+        return self._forward([*self.trunk, *(p[heads] for p in self.stacks)], x)
 
     def _forward(self, params: list[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
         w1, b1, w2, b2, w3, b3, w4, b4 = params
@@ -99,6 +99,10 @@ class Normalizer:
         self._follow()
 
     def _follow(self) -> None:
+        if self.count == 0:  # of an agent that has seen nothing
+            self.mean.zero_()
+            self.std.fill_(1)
+            return
         mean = self.sum / self.count
         variance = self.sum_of_squares / self.count - mean**2
         self.mean.copy_(torch.from_numpy(mean))
@@ -134,28 +138,28 @@ class EnsembleDDPG:
         action_dim: int,
         *,
         gamma: float,
-        heads: int = 16,
+        num_heads: int = 16,
         learning_rate: float = 1e-3,
         polyak: float = 0.95,
         action_penalty: float = 1.0,
         device: str = "cpu",
         seed: int = 0,
     ):
-        self.heads, self.gamma, self.polyak = heads, gamma, polyak
+        self.num_heads, self.gamma, self.polyak = num_heads, gamma, polyak
         self.action_penalty = action_penalty
         self.device = torch.device(device)
         generator = torch.Generator().manual_seed(seed)
-        state = obs_dim + goal_dim
+        state_dim = obs_dim + goal_dim
 
-        common = (heads, generator, device)
-        actor = partial(MultiHeadMLP, state, action_dim, *common, squash=torch.tanh)
-        critic = partial(MultiHeadMLP, state + action_dim, 1, *common)
+        common = (num_heads, generator, device)
+        actor = partial(MultiHeadMLP, state_dim, action_dim, *common, squash=torch.tanh)
+        critic = partial(MultiHeadMLP, state_dim + action_dim, 1, *common)
         self.actor, self.critic = actor(), critic()
         self.target_actor, self.target_critic = actor(), critic()
         self._move_targets(trunk_step=1.0, head_step=1.0)  # targets start as copies
         self._networks = [self.actor, self.critic, self.target_actor, self.target_critic]
-        self._frozen_critic = copy.deepcopy(self.critic)
-        self.normalizer = Normalizer(state, device)
+        self._critic_snapshot = copy.deepcopy(self.critic)  # before gradients are asked for
+        self.normalizer = Normalizer(state_dim, device)
 
         # One Adam for everything; it passes over heads without a gradient, those not updated. With
         # one for each head, as in the released code, the trunks die (NOTES.md, "the trunks' Adam").
@@ -167,7 +171,7 @@ class EnsembleDDPG:
         """Algorithm 2, line 7, without noise: a = μ_k(s, g) for all heads in one call.
         obs (K, E, O) and goal (K, E, G) -> (K, E, A); `heads` picks which K heads act. ValueError
         for rows of another number of heads."""
-        acting = len(range(self.heads)[heads])
+        acting = len(range(self.num_heads)[heads])
         if not (np.ndim(obs) == np.ndim(goal) == 3 and len(obs) == len(goal) == acting):
             shapes = f"obs is {np.shape(obs)} and goal {np.shape(goal)}"
             raise ValueError(f"{shapes}, and must be ({acting}, rows of each head, numbers)")
@@ -186,12 +190,12 @@ class EnsembleDDPG:
         return self._q_variance(self.critic, obs, action, goal)
 
     @torch.no_grad()
-    def frozen_q_variance(self) -> Callable[..., np.ndarray]:
+    def snapshot_q_variance(self) -> Callable[..., np.ndarray]:
         """`q_variance` with the critics as they stand now: a copy of them, which another thread
-        can use while `update_head` changes the originals. It holds until the next call."""
-        here, frozen = self.critic, self._frozen_critic
-        torch._foreach_copy_(frozen.trunk + frozen.heads, here.trunk + here.heads)
-        return partial(self._q_variance, frozen)
+        can use while `update_heads` changes the originals. It holds until the next call."""
+        here, copied = self.critic, self._critic_snapshot
+        torch._foreach_copy_(copied.trunk + copied.stacks, here.trunk + here.stacks)
+        return partial(self._q_variance, copied)
 
     @torch.no_grad()
     def _q_variance(self, critic: MultiHeadMLP, obs, action, goal) -> np.ndarray:
@@ -199,24 +203,29 @@ class EnsembleDDPG:
         q = critic.all_heads(state_action).squeeze(-1)  # (K, B)
         return q.var(dim=0, correction=0).cpu().numpy()
 
-    def update_head(
-        self, k: int | slice, batch: dict[str, np.ndarray], step: bool = True
-    ) -> torch.Tensor:
+    def update_head(self, k: int, batch: dict[str, np.ndarray]) -> torch.Tensor:
         """Algorithm 2, line 16: one DDPG step of head k, Eqs. (2) and (3), conditioned on goals.
 
         batch: obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,) and weight (B,).
-        k: or a slice of n heads, in one pass, with (n, B, ...) in the batch and losses (2, n).
         It moves head k and both trunks, no other head; both gradients are taken before either step.
-        step: False leaves the step to a later call, which then takes one for all heads since the
-        last, the trunks' by the sum of their gradients (NOTES.md, "Heads in turn or at once").
         No state is terminal: episodes have a fixed length. Returns critic's and actor's loss, (2,).
         """
-        losses = self._losses(k, batch)
-        losses.sum().backward()  # the two networks have no parameter in common
-        if step:
-            self.optimizer.step()
-            self.optimizer.zero_grad()
-        return losses.detach()
+        return self.update_heads([k], [batch])[0]
+
+    def update_heads(self, heads: Sequence[int], batches: list[dict]) -> torch.Tensor:
+        """`update_head` of n heads, each with a mini-batch of its own, in one step: the trunks' is
+        by the sum of the heads' gradients (NOTES.md, "Heads in turn or at once"). Returns (n, 2).
+        """
+        losses = []
+        for k, batch in zip(heads, batches, strict=True):
+            losses.append(self._losses(k, batch))
+            losses[-1].sum().backward()  # the two networks have no parameter in common
+        self._step()
+        return torch.stack(losses).detach()
+
+    def _step(self) -> None:
+        self.optimizer.step()
+        self.optimizer.zero_grad()
 
     def _losses(self, k: int | slice, batch: dict[str, np.ndarray]) -> torch.Tensor:
         """Eqs. (2) and (3) of head k, (2,), or of some heads, from arrays (n, B, ...): (2, n)."""
@@ -250,18 +259,18 @@ class EnsembleDDPG:
         the trunk is averaged K times, and K steps of 0.95 are one step of 0.95^K (NOTES.md, "the
         trunk's targets").
         """
-        self._move_targets(1 - self.polyak**self.heads, head_step=1 - self.polyak)
+        self._move_targets(1 - self.polyak**self.num_heads, head_step=1 - self.polyak)
 
     @torch.no_grad()
     def _move_targets(self, trunk_step: float, head_step: float) -> None:
         for target, net in ((self.target_actor, self.actor), (self.target_critic, self.critic)):
             torch._foreach_lerp_(target.trunk, net.trunk, trunk_step)
-            torch._foreach_lerp_(target.heads, net.heads, head_step)
+            torch._foreach_lerp_(target.stacks, net.stacks, head_step)
 
     def state_dict(self) -> dict:
         """Networks, targets, the optimiser's moments and the normaliser, as tensors."""
         return {
-            "networks": [[p.detach() for p in net.trunk + net.heads] for net in self._networks],
+            "networks": [[p.detach() for p in net.trunk + net.stacks] for net in self._networks],
             "optimizer": self.optimizer.state_dict(),
             "normalizer": self.normalizer.state_dict(),
         }
@@ -270,7 +279,7 @@ class EnsembleDDPG:
     def load_state_dict(self, state: dict) -> None:
         """Take over a `state_dict` of an agent of the same sizes."""
         for net, saved in zip(self._networks, state["networks"], strict=True):
-            for p, value in zip(net.trunk + net.heads, saved, strict=True):
+            for p, value in zip(net.trunk + net.stacks, saved, strict=True):
                 p.copy_(value)
         self.optimizer.load_state_dict(state["optimizer"])
         self.normalizer.load_state_dict(state["normalizer"])

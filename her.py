@@ -7,7 +7,6 @@ Letters in the shape comments:
 from collections.abc import Callable
 
 import numpy as np
-import torch
 
 Batch = dict[str, np.ndarray]
 RewardFn = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -19,12 +18,23 @@ class EpisodeBuffer:
     episodes["obs"] (N, T+1, O), ["achieved_goal"] (N, T+1, G), ["desired_goal"] (N, G) and
     ["action"] (N, T, A), float32. No reward is stored: Eq. (1) gives it when it is needed.
     capacity: in transitions (Appendix B: 1e6); ValueError if it holds no whole episode.
+    relabel_ratio, reward_fn: those of `relabel_future`.
     """
 
-    def __init__(self, capacity: int, horizon: int, obs_dim: int, goal_dim: int, action_dim: int):
+    def __init__(
+        self,
+        capacity: int,
+        horizon: int,
+        obs_dim: int,
+        goal_dim: int,
+        action_dim: int,
+        relabel_ratio: float,
+        reward_fn: RewardFn,
+    ):
         if capacity < horizon:
             raise ValueError(f"a buffer of {capacity} transitions holds no episode of {horizon}")
         self.capacity, self.size = capacity // horizon, 0  # in episodes
+        self.relabel_ratio, self.reward_fn = relabel_ratio, reward_fn
         shapes = {
             "obs": (horizon + 1, obs_dim),
             "achieved_goal": (horizon + 1, goal_dim),
@@ -59,14 +69,18 @@ class EpisodeBuffer:
         self.size += free
         return slots
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """What a checkpoint keeps of it: the stored episodes."""
-        return {name: torch.from_numpy(array) for name, array in self.episodes.items()}
+    def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
+        """Algorithm 1, lines 3-4: a mini-batch, its goals relabelled by `relabel_future`."""
+        return relabel_future(self.episodes, batch_size, rng, self.relabel_ratio, self.reward_fn)
 
-    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        self.size = len(state["action"])
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """What a checkpoint keeps of it: the stored episodes."""
+        return self.episodes
+
+    def load_state_dict(self, episodes: dict[str, np.ndarray]) -> None:
+        self.size = len(episodes["action"])
         for name, array in self._data.items():
-            array[: self.size] = state[name].numpy()
+            array[: self.size] = episodes[name]
 
 
 def future_goals(

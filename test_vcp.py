@@ -12,6 +12,7 @@ import threading
 import timeit
 from decimal import Decimal, localcontext
 from fractions import Fraction
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -200,13 +201,12 @@ def test_any_ring_keeps_the_newest_and_draws_only_those(capacity, sizes, tempera
 
 
 def test_algorithm_1_scores_and_stores_what_it_drew():
-    original = EpisodeBuffer(200, 50, 2, 2, 2)
+    original = EpisodeBuffer(200, 50, 2, 2, 2, 0.8, exact_reward)
     original.add(numbered_episodes(), np.random.default_rng(0))
-    agent = EnsembleDDPG(2, 2, 2, gamma=0.98, heads=4)
+    agent = EnsembleDDPG(2, 2, 2, gamma=0.98, num_heads=4)
     buffer = HERBuffer(100, temperature=9)
     for _ in range(2):
-        how = (agent.q_variance, 40, np.random.default_rng(1), 0.8, exact_reward)
-        update_her_buffer(buffer, original, *how)
+        update_her_buffer(buffer, original, agent.q_variance, 40, np.random.default_rng(1))
     assert buffer.size == 80
     rows = {name: x[:80] for name, x in buffer.data.items()}
     expected = agent.q_variance(rows["obs"], rows["action"], rows["goal"])
@@ -221,7 +221,7 @@ def test_algorithm_1_scores_and_stores_what_it_drew():
 
 def test_episode_buffer_fills_then_overwrites_random_episodes():
     rng = np.random.default_rng(0)
-    buffer = EpisodeBuffer(capacity=5 * 3 + 2, horizon=3, obs_dim=2, goal_dim=2, action_dim=2)
+    buffer = EpisodeBuffer(5 * 3 + 2, 3, 2, 2, 2, 0.8, exact_reward)
     episodes = numbered_episodes(9, horizon=3)
 
     def some(*which):
@@ -242,11 +242,11 @@ def test_episode_buffer_fills_then_overwrites_random_episodes():
     with pytest.raises(ValueError):
         buffer.add({name: x[:6] for name, x in episodes.items()}, rng)
     with pytest.raises(ValueError):
-        EpisodeBuffer(capacity=49, horizon=50, obs_dim=2, goal_dim=2, action_dim=2)
+        EpisodeBuffer(49, 50, 2, 2, 2, 0.8, exact_reward)
 
 
 def test_episodes_of_other_shapes_are_refused_by_name():
-    buffer, episodes = EpisodeBuffer(200, 50, 2, 2, 2), numbered_episodes(3)
+    buffer, episodes = EpisodeBuffer(200, 50, 2, 2, 2, 0.8, exact_reward), numbered_episodes(3)
     for name, wrong in (
         ("obs", episodes["obs"][:, 1:]),
         ("achieved_goal", episodes["achieved_goal"][0]),
@@ -281,9 +281,9 @@ def test_rewards_that_are_not_eq_1_are_refused(reward_fn, error, message):
 def test_any_episode_buffer_holds_whole_episodes(capacity, horizon, adds):
     if capacity < horizon:
         with pytest.raises(ValueError):
-            EpisodeBuffer(capacity, horizon, 2, 2, 2)
+            EpisodeBuffer(capacity, horizon, 2, 2, 2, 0.8, exact_reward)
         return
-    buffer, added = EpisodeBuffer(capacity, horizon, 2, 2, 2), 0
+    buffer, added = EpisodeBuffer(capacity, horizon, 2, 2, 2, 0.8, exact_reward), 0
     episodes = numbered_episodes(len(adds) * 5 + 1, horizon)
     for new in adds:
         if new > buffer.capacity:
@@ -408,7 +408,7 @@ class PlainHead(nn.Module):
 def plain_ensemble(net, is_actor):
     """K PlainHeads that share one trunk, with the values of a MultiHeadMLP."""
     heads, trunk = [], None
-    for k in range(len(net.heads[0])):
+    for k in range(len(net.stacks[0])):
         heads.append(PlainHead([*net.trunk, *net.own[k]], trunk, is_actor))
         trunk = heads[-1].trunk
     return heads
@@ -463,7 +463,7 @@ def test_the_ensemble_is_16_separate_networks():
 
 def test_networks_have_the_papers_size_and_start_like_their_targets():
     agent = EnsembleDDPG(10, 3, 4, gamma=0.98)
-    assert HIDDEN == 256 and agent.heads == 16
+    assert HIDDEN == 256 and agent.num_heads == 16
     assert [tuple(p.shape) for p in [*agent.critic.trunk, *agent.critic.own[3]]] == [
         (256, 17), (256,), (256, 256), (256,), (256, 256), (256,), (1, 256), (1,),
     ]  # fmt: skip
@@ -471,15 +471,15 @@ def test_networks_have_the_papers_size_and_start_like_their_targets():
         (agent.actor, agent.target_actor),
         (agent.critic, agent.target_critic),
     ):
-        for p, q in zip(net.trunk + net.heads, target.trunk + target.heads, strict=True):
+        for p, q in zip(net.trunk + net.stacks, target.trunk + target.stacks, strict=True):
             assert torch.equal(p, q) and p.data_ptr() != q.data_ptr()
-        w = net.heads[0]
+        w = net.stacks[0]
         assert abs(w.std().item() - math.sqrt(2 / 512)) < 1e-3  # Xavier-uniform
         assert not torch.equal(w[0], w[1])
     again = EnsembleDDPG(10, 3, 4, gamma=0.98)
     other = EnsembleDDPG(10, 3, 4, gamma=0.98, seed=1)
-    assert torch.equal(agent.actor.heads[0], again.actor.heads[0])
-    assert not torch.equal(agent.actor.heads[0], other.actor.heads[0])
+    assert torch.equal(agent.actor.stacks[0], again.actor.stacks[0])
+    assert not torch.equal(agent.actor.stacks[0], other.actor.stacks[0])
 
 
 def test_a_head_is_trained_through_its_network_with_any_optimiser():
@@ -498,13 +498,13 @@ def test_a_head_is_trained_through_its_network_with_any_optimiser():
     assert len(net.parameters()) == 4 + 4 * 4 and not own[0]
 
 
-@pytest.mark.parametrize("together", [1, 3])
-def test_updates_are_those_of_plain_ddpg(together):
+@pytest.mark.parametrize("turns", [[[1], [2], [1], [0], [1]], [[0, 1, 2], [2, 0]]], ids=str)
+def test_updates_are_those_of_plain_ddpg(turns):
     """Eqs. (2) and (3), step by step, against plain modules, plain Adam and the textbook's loss:
     own targets, clipping, weights, gradients before steps, one Adam of the trunk for all heads. Of
     heads that step together the trunk's gradients are added up. The gradients themselves are
     compared too, as Adam's step hides their scale."""
-    agent = random_agent(heads=3, action_penalty=0.3, learning_rate=2e-3)
+    agent = random_agent(num_heads=3, action_penalty=0.3, learning_rate=2e-3)
     actors, critics = plain_ensemble(agent.actor, True), plain_ensemble(agent.critic, False)
     target_actors = plain_ensemble(agent.target_actor, True)
     target_critics = plain_ensemble(agent.target_critic, False)
@@ -517,37 +517,36 @@ def test_updates_are_those_of_plain_ddpg(together):
     params = [*agent.actor.parameters(), *agent.critic.parameters()]
     gradients = {}  # with which the agent last stepped
     agent.optimizer.register_step_pre_hook(lambda *_: gradients.update({p: p.grad for p in params}))
-    moved = set()
-    for i, k in enumerate([1, 2, 1, 0, 1] if together == 1 else [0, 1, 2, 0, 1, 2]):
-        batch = random_batch(seed=i)
-        state, next_state, action, reward, weight = as_tensors(agent, batch)
-        with torch.no_grad():
-            y = reward + 0.9 * target_critics[k](next_state, target_actors[k](next_state))
-            y = torch.clip(y, -1 / (1 - 0.9), 0)
-        critic_loss = (weight * (critics[k](state, action) - y) ** 2).mean()
-        pi = actors[k](state)
-        actor_loss = -(weight * critics[k](state, pi)).mean() + 0.3 * (weight * pi**2).mean()
-        for loss, net in ((critic_loss, critics[k]), (actor_loss, actors[k])):
-            its_params = [*net.parameters()]
-            its_gradients = torch.autograd.grad(loss, its_params, retain_graph=True)
-            for p, g in zip(its_params, its_gradients, strict=True):
-                p.grad = g if p.grad is None else p.grad + g
-        moved.add(k)
-        step = (i + 1) % together == 0
-        losses = agent.update_head(k, batch, step)
-        if step:
-            for plain, net in ((actors, agent.actor), (critics, agent.critic)):
-                for j in moved:
-                    own = [gradients[p] for p in (*net.trunk, *net.own[j])]
-                    expected = [p.grad for p in plain[j].parameters()]
-                    torch.testing.assert_close(own, expected, rtol=1e-3, atol=1e-5)
-            for optimizer in (*trunks, *(adam for k in moved for adam in heads[k])):
-                optimizer.step()
-                optimizer.zero_grad()
-            moved = set()
-        torch.testing.assert_close(
-            losses, torch.stack([critic_loss, actor_loss]).detach(), rtol=1e-4, atol=1e-5
-        )
+    batches = (random_batch(seed=i) for i in range(6))
+    for together in turns:
+        drawn, expected = [next(batches) for _ in together], []
+        for k, batch in zip(together, drawn, strict=True):
+            state, next_state, action, reward, weight = as_tensors(agent, batch)
+            with torch.no_grad():
+                y = reward + 0.9 * target_critics[k](next_state, target_actors[k](next_state))
+                y = torch.clip(y, -1 / (1 - 0.9), 0)
+            critic_loss = (weight * (critics[k](state, action) - y) ** 2).mean()
+            pi = actors[k](state)
+            actor_loss = -(weight * critics[k](state, pi)).mean() + 0.3 * (weight * pi**2).mean()
+            for loss, net in ((critic_loss, critics[k]), (actor_loss, actors[k])):
+                its_params = [*net.parameters()]
+                its_gradients = torch.autograd.grad(loss, its_params, retain_graph=True)
+                for p, g in zip(its_params, its_gradients, strict=True):
+                    p.grad = g if p.grad is None else p.grad + g
+            expected.append(torch.stack([critic_loss, actor_loss]).detach())
+        if len(together) == 1:
+            losses = agent.update_head(*together, *drawn)[None]
+        else:
+            losses = agent.update_heads(together, drawn)
+        torch.testing.assert_close(losses, torch.stack(expected), rtol=1e-4, atol=1e-5)
+        for plain, net in ((actors, agent.actor), (critics, agent.critic)):
+            for k in together:
+                own = [gradients[p] for p in (*net.trunk, *net.own[k])]
+                expected = [p.grad for p in plain[k].parameters()]
+                torch.testing.assert_close(own, expected, rtol=1e-3, atol=1e-5)
+        for optimizer in (*trunks, *(adam for k in together for adam in heads[k])):
+            optimizer.step()
+            optimizer.zero_grad()
     for plain, net in ((actors, agent.actor), (critics, agent.critic)):
         for k in range(3):
             for p, q in zip(plain[k].parameters(), [*net.trunk, *net.own[k]], strict=True):
@@ -555,12 +554,12 @@ def test_updates_are_those_of_plain_ddpg(together):
 
 
 def test_update_of_a_head_moves_it_and_the_trunk_and_nothing_else():
-    agent = random_agent(heads=4)
+    agent = random_agent(num_heads=4)
     nets = (agent.actor, agent.critic, agent.target_actor, agent.target_critic)
-    before = [[p.detach().clone() for p in (*net.trunk, *net.heads)] for net in nets]
+    before = [[p.detach().clone() for p in (*net.trunk, *net.stacks)] for net in nets]
     agent.update_head(2, random_batch())
     for i, net in enumerate(nets):
-        for p, old in zip((*net.trunk, *net.heads), before[i], strict=True):
+        for p, old in zip((*net.trunk, *net.stacks), before[i], strict=True):
             if i >= 2:  # targets
                 assert torch.equal(p, old)
             elif any(p is q for q in net.trunk):
@@ -574,8 +573,8 @@ def test_targets_are_clipped_to_the_range_of_returns():
     """With targets far outside [-1/(1-γ), 0] = [-10, 0], the loss is that of the bound."""
     batch = random_batch()
     for bias, bound in ((1000.0, 0.0), (-1000.0, -10.0)):
-        agent = random_agent(heads=2)
-        agent.target_critic.heads[3].fill_(bias)
+        agent = random_agent(num_heads=2)
+        agent.target_critic.stacks[3].fill_(bias)
         state, _, action, _, weight = as_tensors(agent, batch)
         with torch.no_grad():
             q = plain_ensemble(agent.critic, False)[1](state, action)
@@ -584,21 +583,21 @@ def test_targets_are_clipped_to_the_range_of_returns():
 
 
 def test_polyak_moves_the_shared_trunk_once_for_each_head():
-    agent = random_agent(heads=5, polyak=0.9)
+    agent = random_agent(num_heads=5, polyak=0.9)
     expected = []
     for target, net in ((agent.target_actor, agent.actor), (agent.target_critic, agent.critic)):
-        trunk, heads = copy.deepcopy(target.trunk), copy.deepcopy(target.heads)
+        trunk, heads = copy.deepcopy(target.trunk), copy.deepcopy(target.stacks)
         for k in range(5):  # as it is said: for each head, its trunk and its head
             for p, q in zip(trunk, net.trunk, strict=True):
                 p.mul_(0.9).add_(0.1 * q.detach())
-            for p, q in zip(heads, net.heads, strict=True):
+            for p, q in zip(heads, net.stacks, strict=True):
                 p[k] = 0.9 * p[k] + 0.1 * q[k].detach()
         expected.append((trunk, heads))
     agent.update_targets()
     for target, (trunk, heads) in zip(
         (agent.target_actor, agent.target_critic), expected, strict=True
     ):
-        for p, q in zip(target.trunk + target.heads, trunk + heads, strict=True):
+        for p, q in zip(target.trunk + target.stacks, trunk + heads, strict=True):
             torch.testing.assert_close(p, q)
 
 
@@ -819,16 +818,13 @@ def test_reacher_reports_the_fingertips_velocity():
 
 
 @pytest.mark.parametrize(
-    ("acting_head", "collecting", "together", "steps"),
-    [("all", (4, 4, 2), 1, {0, 1, 2, 3}), ("one", (1, 16, 2), 2, {1, 3})],
+    ("acting_head", "collecting", "together"), [("all", (4, 4, 2), 1), ("one", (1, 16, 2), 2)]
 )
-def test_train_does_what_algorithm_2_says(
-    acting_head, collecting, together, steps, tmp_path, monkeypatch
-):
+def test_train_does_what_algorithm_2_says(acting_head, collecting, together, tmp_path, monkeypatch):
     """The calls, in order: B_h filled with as much as B_o holds; then Algorithm 1 beside the heads,
     which are updated in turn, each with a mini-batch of its own; the targets once a cycle; the
     normaliser fed with every step."""
-    calls, agents, goals, scores, frozen, threads = [], [], [], [], [], set()
+    calls, agents, goals, scores, snapshots, threads = [], [], [], [], [], set()
     heads_moved = threading.Event()
 
     class Spy(EnsembleDDPG):
@@ -836,11 +832,13 @@ def test_train_does_what_algorithm_2_says(
             super().__init__(*args, **kwargs)
             agents.append(self)
 
-        def update_head(self, k, batch, step):
-            calls.append((k, batch["obs"].tobytes()))
-            assert len(batch["obs"]) == 16 and step is (k in steps)
-            losses = super().update_head(k, batch, step)
-            if k == 3:
+        def update_heads(self, heads, batches):
+            assert len(heads) == together
+            for k, batch in zip(heads, batches, strict=True):
+                calls.append((k, batch["obs"].tobytes()))
+                assert len(batch["obs"]) == 16
+            losses = super().update_heads(heads, batches)
+            if 3 in heads:
                 heads_moved.set()
             return losses
 
@@ -852,10 +850,10 @@ def test_train_does_what_algorithm_2_says(
             goals.append(goal)
             return super().act(obs, goal, heads)
 
-        def frozen_q_variance(self):
-            calls.append("frozen")
-            frozen.append(copy.deepcopy(self))
-            return super().frozen_q_variance()
+        def snapshot_q_variance(self):
+            calls.append("snapshot")
+            snapshots.append(copy.deepcopy(self))
+            return super().snapshot_q_variance()
 
     def spy_on_the_first(her_buffer, original_buffer, q_variance, size, *args):
         calls.append(("first", size))
@@ -894,12 +892,12 @@ def test_train_does_what_algorithm_2_says(
     settings |= {"heads_at_once": together}
     (row,) = train(Config(**settings, env="PointMassEmptyEnv-v1", out=str(tmp_path / "run")))
     names = [call if isinstance(call, str) else call[0] for call in calls]
-    sweep = ["frozen", 0, 1, 2, 3, "stored"]  # B_h stands still meanwhile
+    sweep = ["snapshot", 0, 1, 2, 3, "stored"]  # B_h stands still meanwhile
     assert names == ["first"] + 2 * (3 * sweep + ["targets"])
     # the scores are the critics' at the beginning of the sweep, from another thread
     assert threading.current_thread() not in threads and len(threads) == 1
-    assert len(scores) == len(frozen) == 6
-    for (variance, rows, moved), critics in zip(scores, frozen, strict=True):
+    assert len(scores) == len(snapshots) == 6
+    for (variance, rows, moved), critics in zip(scores, snapshots, strict=True):
         np.testing.assert_allclose(variance, critics.q_variance(*rows), rtol=1e-3, atol=1e-6)
         assert np.abs(variance - moved).max() > 1e-4
     # scored for each one drawn: 2, in each sweep
@@ -919,7 +917,7 @@ def test_an_error_beside_the_training_ends_the_run_with_its_message(where, tmp_p
         raise FloatingPointError("NaN or Inf in here")
 
     monkeypatch.setattr(
-        *{"score": (run, "score"), "update": (EnsembleDDPG, "update_head")}[where], fail
+        *{"score": (run, "score"), "update": (EnsembleDDPG, "update_heads")}[where], fail
     )
     settings = {**SMALL_TRAINING, "env": "PointMassEmptyEnv-v1", "num_workers": 1}
     with pytest.raises(FloatingPointError, match="in here"):
@@ -946,14 +944,14 @@ def test_success_is_read_at_the_last_step():
 
 
 def test_heads_act_in_their_own_environments():
-    agent = random_agent(heads=4, obs_dim=2, goal_dim=2)
+    agent = random_agent(num_heads=4, obs_dim=2, goal_dim=2)
     rng = np.random.default_rng(0)
     obs, goal = rng.normal(size=(8, 2)), rng.normal(size=(8, 2))
     for parts in (1, 2, 4, 8):  # workers
         rows = [slice(i * 8 // parts, (i + 1) * 8 // parts) for i in range(parts)]
 
         def acted(heads):
-            policy = run.greedy(agent, heads, 8)
+            policy = run.acting_heads(agent, heads, 8)
             return np.concatenate([policy(0, r, obs[r], goal[r]) for r in rows])  # noqa: B023
 
         actions = acted(4)
@@ -970,10 +968,17 @@ def test_exploration_noise():
 
     def explored(noise, random_actions):
         rng = np.random.default_rng(0)
-        still = lambda t, rows, obs, goal: np.full((rows.stop - rows.start, 2), 0.9)  # noqa: E731
-        policy = run.exploring(still, rng, (steps, n, 2), noise, random_actions)
+        still = SimpleNamespace(act=lambda obs, goal, heads: np.full((1, obs.shape[1], 2), 0.9))
+        drawn = run.exploration(rng, (steps, n, 2), noise, random_actions)
+        policy = run.acting_heads(still, 1, n, drawn)
         half = [slice(0, n // 2), slice(n // 2, n)]
-        return np.concatenate([policy(t, r, None, None) for t in range(steps) for r in half])
+        return np.concatenate(
+            [
+                policy(t, r, np.zeros((n // 2, 2)), np.zeros((n // 2, 2)))
+                for t in range(steps)
+                for r in half
+            ]
+        )
 
     actions = explored(noise=0.2, random_actions=0.0)
     np.testing.assert_allclose(np.quantile(actions - 0.9, 0.25), -0.2 * 0.6745, atol=0.005)
@@ -1005,7 +1010,7 @@ def test_the_same_seed_gives_the_same_rows(tmp_path):
 
 def test_each_seed_and_epoch_has_random_numbers_of_its_own(tmp_path, monkeypatch):
     """Seeds of the environments; what episodes, Algorithm 1 and draws take, each its own stream."""
-    resets, streams = [], {"exploring": [], "score": [], "sample": []}
+    resets, streams = [], {"exploration": [], "score": [], "sample": []}
 
     def spy(owner, name, note):
         function = getattr(owner, name)
@@ -1015,7 +1020,7 @@ def test_each_seed_and_epoch_has_random_numbers_of_its_own(tmp_path, monkeypatch
         return lambda *args: streams[name].append(args[place].bit_generator.state["state"]["inc"])
 
     spy(ParallelEnvs, "reset", lambda envs, seed: resets.append(seed))
-    spy(run, "exploring", stream("exploring", 1))
+    spy(run, "exploration", stream("exploration", 0))
     spy(run, "score", stream("score", 3))
     spy(HERBuffer, "sample", stream("sample", 2))
     settings = {**SMALL_TRAINING, "env": "PointMassEmptyEnv-v1", "epochs": 2, "num_workers": 1}
@@ -1024,7 +1029,7 @@ def test_each_seed_and_epoch_has_random_numbers_of_its_own(tmp_path, monkeypatch
     assert len(resets) == len(set(resets)) == 2 * 2 * 2  # seeds, epochs, training and testing
     assert {name: len(set(used)) for name, used in streams.items()} == dict.fromkeys(streams, 4)
     assert len(set().union(*streams.values())) == 3 * 4
-    assert len(streams["exploring"]) == 2 * (3 + 2)  # the first epoch has one cycle more
+    assert len(streams["exploration"]) == 2 * (3 + 2)  # the first epoch has one cycle more
 
 
 @pytest.mark.parametrize(

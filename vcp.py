@@ -11,9 +11,8 @@ Letters in the shape comments:
 from collections.abc import Callable
 
 import numpy as np
-import torch
 
-from her import Batch, EpisodeBuffer, RewardFn, relabel_future
+from her import Batch, EpisodeBuffer
 
 # σ² of Q_k(s, a, g) over the critics, of obs (B, O), action (B, A) and goal (B, G): (B,)
 QVariance = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -112,11 +111,11 @@ class HERBuffer:
 
     def state_dict(self) -> dict:
         """What a checkpoint keeps of it: the stored rows, and where the next ones go."""
-        rows = {name: torch.from_numpy(x[: self.size]) for name, x in self.data.items()}
+        rows = {name: x[: self.size] for name, x in self.data.items()}
         return {"rows": rows, "next": self._next}
 
     def load_state_dict(self, state: dict) -> None:
-        rows = {name: x.numpy() for name, x in state["rows"].items()}
+        rows = dict(state["rows"])
         variance = rows.pop("variance")
         self.data, self.size, self._next = {}, 0, 0
         self.add(rows, variance)
@@ -129,22 +128,24 @@ def score(
     q_variance: QVariance,
     batch_size: int,
     rng: np.random.Generator,
-    relabel_ratio: float,
-    reward_fn: RewardFn,
 ) -> tuple[Batch, np.ndarray]:
-    """Algorithm 1, lines 3-5. Returns a mini-batch (`relabel_future`) and its variances (B,).
+    """Algorithm 1, lines 3-5. Returns a mini-batch (`EpisodeBuffer.sample`) and its variances (B,).
 
     It changes nothing, so another thread can do it while the heads are trained, as Algorithm 2,
-    line 13, has it, with critics that stand still: `EnsembleDDPG.frozen_q_variance`.
+    line 13, has it, with critics that stand still: `EnsembleDDPG.snapshot_q_variance`.
     """
-    # 3-4: a mini-batch of B_o, its goals relabelled by 'future'
-    batch = relabel_future(original_buffer.episodes, batch_size, rng, relabel_ratio, reward_fn)
+    batch = original_buffer.sample(batch_size, rng)  # 3-4: from B_o, goals relabelled by 'future'
     # 5: the variance of the K Q-values of each transition
     return batch, q_variance(batch["obs"], batch["action"], batch["goal"])
 
 
-def update_her_buffer(her_buffer: HERBuffer, *drawing) -> None:
-    """Algorithm 1, lines 3-7, once. drawing: the arguments of `score`.
-    ValueError if the mini-batch exceeds the capacity of B_h."""
-    her_buffer.add(*score(*drawing))  # 3-6
+def update_her_buffer(
+    her_buffer: HERBuffer,
+    original_buffer: EpisodeBuffer,
+    q_variance: QVariance,
+    batch_size: int,
+    rng: np.random.Generator,
+) -> None:
+    """Algorithm 1, lines 3-7, once. ValueError if the mini-batch exceeds the capacity of B_h."""
+    her_buffer.add(*score(original_buffer, q_variance, batch_size, rng))  # 3-6
     her_buffer.update_priorities()  # 7

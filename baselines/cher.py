@@ -11,7 +11,7 @@ Letters in the shape comments:
 import numpy as np
 
 from baselines.her import HERReplay
-from her import Batch, future_goals, transitions
+from her import Batch, EpisodeBuffer, future_goals, transitions
 
 GROWTH = 1e-4  # of λ, with each update
 TRIO = 3  # candidates that are looked at for one to be taken
@@ -45,15 +45,12 @@ def select(
     selected: int,
     proximity: np.ndarray,
     rng: np.random.Generator,
-    faithful: bool = False,
 ) -> np.ndarray:
     """Stochastic greedy maximisation of diversity - λ Σ distance: S times, draw three different
     remaining candidates, take the best of them.
 
     goal, achieved: (U, M, G), of each candidate the relabelled goal and what was achieved then.
     selected: S, at most M - 2. proximity: λ for each mini-batch, (U,).
-    faithful: a candidate that leads its trio for a moment and is then beaten counts as selected in
-        the diversity from there on, as in the original: it has nothing to add any more.
     Returns the chosen candidates, (U, S).
     """
     sets, candidates = goal.shape[:2]
@@ -80,10 +77,6 @@ def select(
         chosen[:, s] = trio[best, row]
         # The last of those that remain moves to the place of the one that leaves.
         remaining[row, place[best, row]] = remaining[:, r[s] - 1]
-        if faithful:
-            before = np.maximum.accumulate(np.vstack([np.full(sets, -np.inf), value]))[:-1]
-            led = value > before
-            gain[np.broadcast_to(row, led.shape)[led], trio[led]] = 0
     return chosen
 
 
@@ -94,13 +87,14 @@ class CHER(HERReplay):
     again. All heads of an ensemble update share a τ, so that it does not grow K times as fast.
 
     Where the task is to rotate an object, its orientation alone counts, as in the original.
-    heads: K; updates: of all heads, in an epoch; faithful: as in `select`.
+    heads: K; updates: of all heads, in an epoch.
     """
 
-    def __init__(self, *her, env_name: str, heads: int, updates: int, faithful=False, **at_once):
-        super().__init__(*her, **at_once)
+    def __init__(
+        self, buffer: EpisodeBuffer, *, env_name: str, heads: int, updates: int, **at_once
+    ):
+        super().__init__(buffer, **at_once)
         self.goal_part = slice(3 if "Rotate" in env_name else 0, None)
-        self.faithful = faithful
         self.heads, self.updates, self.drawn = heads, updates, 0
 
     def draw(self, count: int, batch_size: int, rng: np.random.Generator) -> Batch:
@@ -108,7 +102,7 @@ class CHER(HERReplay):
         n, horizon = episodes["action"].shape[:2]
         e = rng.integers(n, size=count * candidates)
         t = rng.integers(horizon, size=count * candidates)
-        goal, hindsight = future_goals(episodes, e, t, rng, self.relabel_ratio)
+        goal, hindsight = future_goals(episodes, e, t, rng, self.buffer.relabel_ratio)
 
         def by_batch(x):
             return x[:, self.goal_part].reshape(count, candidates, -1)
@@ -117,6 +111,6 @@ class CHER(HERReplay):
         self.drawn += count
         achieved = by_batch(episodes["achieved_goal"][e, t])
         proximity = (1 + GROWTH) ** tau
-        chosen = select(by_batch(goal), achieved, batch_size, proximity, rng, self.faithful)
+        chosen = select(by_batch(goal), achieved, batch_size, proximity, rng)
         i = (chosen + candidates * np.arange(count)[:, None]).reshape(-1)
-        return transitions(episodes, e[i], t[i], goal[i], hindsight[i], self.reward_fn)
+        return transitions(episodes, e[i], t[i], goal[i], hindsight[i], self.buffer.reward_fn)

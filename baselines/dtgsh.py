@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from baselines.her import HERReplay
-from her import Batch, future_goals, transitions
+from her import Batch, EpisodeBuffer, future_goals, transitions
 
 CANDIDATES = 100 / 64  # for each that is selected
 SMALLEST = 1e-12  # an eigenvalue's share of the largest; below it is rounding
@@ -58,24 +58,17 @@ def choose_eigenvectors(eigenvalues: np.ndarray, k: int, rng: np.random.Generato
     return chosen
 
 
-def sample_k_dpp(
-    kernel: np.ndarray, k: int, rng: np.random.Generator, faithful: bool = False
-) -> np.ndarray:
+def sample_k_dpp(kernel: np.ndarray, k: int, rng: np.random.Generator) -> np.ndarray:
     """Samples of k-DPPs: sets S of k different items with P(S) = det(L_S) / e_k(λ).
 
     kernel: L, (U, M, M), symmetric and positive semidefinite. Returns (U, k), items of each set.
-    faithful: always the eigenvectors of the k largest eigenvalues. The original's polynomials
-        are zero in floating point for goals like Fetch's, which leaves it the first k.
     """
     sets, m = kernel.shape[:2]
     eigenvalues, vectors = (x.numpy() for x in torch.linalg.eigh(torch.from_numpy(kernel)))
-    if faithful:
-        vectors = vectors[:, :, m - k :]  # eigh sorts them upwards
-    else:
-        # Goals that are equal or close leave eigenvalues of zero, give or take the rounding.
-        eigenvalues = np.maximum(eigenvalues, SMALLEST * eigenvalues[:, -1:])
-        chosen = choose_eigenvectors(eigenvalues, k, rng)
-        vectors = vectors[np.broadcast_to(chosen[:, None], vectors.shape)].reshape(sets, m, k)
+    # Goals that are equal or close leave eigenvalues of zero, give or take the rounding.
+    eigenvalues = np.maximum(eigenvalues, SMALLEST * eigenvalues[:, -1:])
+    chosen = choose_eigenvectors(eigenvalues, k, rng)
+    vectors = vectors[np.broadcast_to(chosen[:, None], vectors.shape)].reshape(sets, m, k)
     # What is left is the DPP of the projection K = V Vᵀ: take an item with probability ∝ K_ii,
     # condition K on it, and again. Conditioning is a step of Cholesky's decomposition of K, with
     # the item as the pivot; it leaves of the diagonal what the columns so far do not explain.
@@ -103,15 +96,13 @@ class DTGSH(HERReplay):
     The kernel is exp(-|g_i - g_j|² / 2σ²), with σ = 0.1 for the Hand and 0.5 elsewhere. Fetch's
     diversities are limited to 0.001. Where the task is to rotate an object, its orientation alone
     counts. All of this is the original's, which has settings for Fetch and Hand only.
-    faithful: as in `sample_k_dpp`.
     """
 
-    def __init__(self, *her, env_name: str, faithful=False, **at_once):
-        super().__init__(*her, **at_once)
+    def __init__(self, buffer: EpisodeBuffer, *, env_name: str, **at_once):
+        super().__init__(buffer, **at_once)
         self.sigma = 0.1 if env_name.startswith("Hand") else 0.5
         self.most = 0.001 if env_name.startswith("Fetch") else np.inf
         self.goal_part = slice(3 if "Rotate" in env_name else 0, None)
-        self.faithful = faithful
         self.diversity = np.zeros(self.buffer.capacity)
         self.cumulative = np.empty(0)
 
@@ -130,13 +121,13 @@ class DTGSH(HERReplay):
         e = np.searchsorted(self.cumulative, u, side="right")
         t = rng.integers(episodes["action"].shape[1], size=count * candidates)
         # As many original goals among the candidates as there are in a mini-batch of HER.
-        relabel_ratio = 1 - batch_size * (1 - self.relabel_ratio) / candidates
+        relabel_ratio = 1 - batch_size * (1 - self.buffer.relabel_ratio) / candidates
         goal, hindsight = future_goals(episodes, e, t, rng, relabel_ratio)
 
         g = goal[:, self.goal_part].reshape(count, candidates, -1).astype(np.float64)
         square = np.square(g).sum(axis=-1)  # |g_i - g_j|² = |g_i|² + |g_j|² - 2 g_i·g_j
         distance2 = square[:, :, None] + square[:, None] - 2 * g @ g.transpose(0, 2, 1)
         kernel = np.exp(-np.maximum(distance2, 0) / (2 * self.sigma**2))
-        items = sample_k_dpp(kernel, batch_size, rng, self.faithful)
+        items = sample_k_dpp(kernel, batch_size, rng)
         i = (items + candidates * np.arange(count)[:, None]).reshape(-1)
-        return transitions(episodes, e[i], t[i], goal[i], hindsight[i], self.reward_fn)
+        return transitions(episodes, e[i], t[i], goal[i], hindsight[i], self.buffer.reward_fn)

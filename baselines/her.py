@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from her import Batch, EpisodeBuffer, RewardFn, relabel_future
+from her import Batch, EpisodeBuffer
 
 
 class HERReplay:
@@ -13,11 +13,8 @@ class HERReplay:
         so that this is a matter of speed alone; a divisor of those a cycle takes leaves none over.
     """
 
-    def __init__(
-        self, buffer: EpisodeBuffer, relabel_ratio: float, reward_fn: RewardFn, at_once: int = 1
-    ):
-        self.buffer, self.relabel_ratio, self.reward_fn = buffer, relabel_ratio, reward_fn
-        self.at_once, self._left = at_once, 0
+    def __init__(self, buffer: EpisodeBuffer, at_once: int = 1):
+        self.buffer, self.at_once, self._left = buffer, at_once, 0
         self.data: Batch = {}  # what was drawn last, at_once mini-batches
         self.size = 0  # its rows
 
@@ -27,9 +24,7 @@ class HERReplay:
 
     def draw(self, count: int, batch_size: int, rng: np.random.Generator) -> Batch:
         """`count` mini-batches, one after the other in arrays of count·batch_size rows."""
-        size = count * batch_size
-        episodes = self.buffer.episodes
-        return relabel_future(episodes, size, rng, self.relabel_ratio, self.reward_fn)
+        return self.buffer.sample(count * batch_size, rng)
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
         """The next mini-batch, with a "weight" of 1 for each transition."""

@@ -10,7 +10,7 @@ Letters in the shape comments:
 import numpy as np
 
 from baselines.her import HERReplay
-from her import Batch, future_goals, transitions
+from her import Batch, EpisodeBuffer, future_goals, transitions
 
 GRAVITY = 9.81  # m/s²; masses are 1 kg and moments of inertia 1 kg·m²
 MOST_PER_STEP = {"Fetch": 0.5, "Hand": 2.5}  # J; the original's README, by the environment's name
@@ -23,17 +23,8 @@ def rotation(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return 2 * np.arccos(np.minimum(abs((before * after).sum(axis=-1)), 1))
 
 
-def euler_angles(q: np.ndarray) -> np.ndarray:
-    """Roll, pitch and yaw in radians of unit quaternions (..., 4), w first -> (..., 3)."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.stack([roll, pitch, yaw], axis=-1)
-
-
 def trajectory_energy(
-    achieved_goal: np.ndarray, dt: float, most_per_step: float = np.inf, faithful: bool = False
+    achieved_goal: np.ndarray, dt: float, most_per_step: float = np.inf
 ) -> np.ndarray:
     """The energy in J that the object gained over each episode, losses not counted against gains.
 
@@ -41,8 +32,6 @@ def trajectory_energy(
         space (Fetch: 1, HandReach: 5 fingertips, whose energies are added), 7 a position and a
         quaternion, anything else coordinates in a plane, which have no height.
     dt: seconds between steps; most_per_step: what counts at most of one step's gain.
-    faithful: rotational energy from differences of Euler angles, as the original has it. They jump
-        by 2π where an angle passes ±π: 12,000 J at dt = 0.04.
     """
     x = np.asarray(achieved_goal, dtype=np.float64)
     goal_dim = x.shape[-1]
@@ -55,11 +44,7 @@ def trajectory_energy(
         energy += GRAVITY * (height[:, 1:] - height[:, :1]).sum(axis=-1)  # PE = m g (z_t - z_0)
     if pose:
         q = x[..., 3:]
-        if faithful:
-            angle = np.diff(euler_angles(q), axis=1)
-        else:
-            angle = rotation(q[:, :-1], q[:, 1:])[..., None]
-        energy += 0.5 * np.square(angle / dt).sum(axis=-1)  # RE = ½ I |ω|²
+        energy += 0.5 * np.square(rotation(q[:, :-1], q[:, 1:]) / dt)  # RE = ½ I |ω|²
     gain = np.diff(energy, axis=1, prepend=0)  # ΔE_1 = E_1, ΔE_t = E_t - E_{t-1}
     return np.clip(gain, 0, most_per_step).sum(axis=1)
 
@@ -68,15 +53,17 @@ class HEREBP(HERReplay):
     """Episodes are drawn with probability ∝ energy^(1/(temperature + 0.01)), transitions and goals
     in them as in HER. The energy is computed once, when an episode is stored.
 
-    dt, faithful: as in `trajectory_energy`.
+    dt: as in `trajectory_energy`.
     """
 
-    def __init__(self, *her, env_name: str, dt: float, temperature=1.0, faithful=False, **at_once):
-        super().__init__(*her, **at_once)
+    def __init__(
+        self, buffer: EpisodeBuffer, *, env_name: str, dt: float, temperature=1.0, **at_once
+    ):
+        super().__init__(buffer, **at_once)
         most_per_step = next(
             (m for k, m in MOST_PER_STEP.items() if env_name.startswith(k)), np.inf
         )
-        self.settings = (dt, most_per_step, faithful)
+        self.settings = (dt, most_per_step)
         self.exponent = 1 / (temperature + 0.01)
         self.energy = np.zeros(self.buffer.capacity)
         self.cumulative = np.empty(0)
@@ -94,5 +81,5 @@ class HEREBP(HERReplay):
         # Inverse transform sampling: the first e with p_1 + ... + p_e > u.
         e = np.searchsorted(self.cumulative, rng.random(size), side="right")
         t = rng.integers(episodes["action"].shape[1], size=size)
-        goal, hindsight = future_goals(episodes, e, t, rng, self.relabel_ratio)
-        return transitions(episodes, e, t, goal, hindsight, self.reward_fn)
+        goal, hindsight = future_goals(episodes, e, t, rng, self.buffer.relabel_ratio)
+        return transitions(episodes, e, t, goal, hindsight, self.buffer.reward_fn)

@@ -33,12 +33,12 @@ DT, G = 0.04, 9.81
 OTHERS = ["her", "herebp", "cher", "dtgsh"]
 
 
-def stored(achieved_goal, **others):
+def stored(achieved_goal, ratio=0.6, reward_fn=exact_reward):
     """B_o with these achieved goals, (N, T+1, G); obs and action say which episode and step."""
     n, steps, goal_dim = achieved_goal.shape
     episodes = {**numbered_episodes(n, steps - 1, goal_dim), "achieved_goal": achieved_goal}
-    buffer = EpisodeBuffer(n * (steps - 1), steps - 1, 2, goal_dim, 2)
-    buffer.add({**episodes, **others}, np.random.default_rng(0))
+    buffer = EpisodeBuffer(n * (steps - 1), steps - 1, 2, goal_dim, 2, ratio, reward_fn)
+    buffer.add(episodes, np.random.default_rng(0))
     return buffer
 
 
@@ -65,27 +65,27 @@ def hindsight_frequencies(batch, n, horizon):
 def test_vcp_without_prioritization_samples_like_her():
     """Sections 5.6 and 5.9: VCP without prioritization is HER with the ensemble."""
     n, horizon, rng = 3, 5, np.random.default_rng(0)
-    buffer = EpisodeBuffer(n * horizon, horizon, 2, 2, 2)
+    buffer = EpisodeBuffer(n * horizon, horizon, 2, 2, 2, 0.6, exact_reward)
     buffer.add(numbered_episodes(n, horizon), rng)
 
-    her = HERReplay(buffer, 0.6, exact_reward, at_once=5)
+    her = HERReplay(buffer, at_once=5)
     batches = [her.sample(2_000, rng) for _ in range(15)]
     drawn = {name: np.concatenate([b[name] for b in batches]) for name in batches[0]}
     assert_frequencies(*hindsight_frequencies(drawn, n, horizon))
     assert (drawn["weight"] == 1).all()
 
-    agent = EnsembleDDPG(2, 2, 2, gamma=0.98, heads=2)
+    agent = EnsembleDDPG(2, 2, 2, gamma=0.98, num_heads=2)
     her_buffer = HERBuffer(300_000, temperature=9, priority="uniform")
-    update_her_buffer(her_buffer, buffer, agent.q_variance, 300_000, rng, 0.6, exact_reward)
+    update_her_buffer(her_buffer, buffer, agent.q_variance, 300_000, rng)
     drawn = her_buffer.sample(30_000, rng)
     assert_frequencies(*hindsight_frequencies(drawn, n, horizon))
     np.testing.assert_allclose(drawn["weight"], 1, rtol=1e-6)
 
 
 def test_what_was_drawn_without_new_episodes_is_dropped():
-    buffer = EpisodeBuffer(20, 5, 2, 2, 2)
+    buffer = EpisodeBuffer(20, 5, 2, 2, 2, 0.8, exact_reward)
     rng = np.random.default_rng(0)
-    her = HERReplay(buffer, 0.8, exact_reward, at_once=4)
+    her = HERReplay(buffer, at_once=4)
     her.new_episodes(buffer.add(numbered_episodes(1, 5), rng))
     assert not her.sample(100, rng)["obs"][:, 0].any()
     assert len({her.sample(100, rng)["obs"].tobytes() for _ in range(6)}) == 6
@@ -156,14 +156,6 @@ def test_energy_of_a_rotation(axis):
     assert trajectory_energy(poses, DT)[0] == pytest.approx(expected)
 
 
-def test_the_originals_euler_angles_jump():
-    poses = turning(np.arange(60) * 0.1)
-    jump = 0.5 * ((2 * math.pi - 0.1) / DT) ** 2
-    assert trajectory_energy(poses, DT, faithful=True)[0] == pytest.approx(jump, rel=1e-3)
-    before = poses[:, :30]  # up to 2.9 rad
-    assert trajectory_energy(before, DT, faithful=True)[0] == pytest.approx(0.5 * (0.1 / DT) ** 2)
-
-
 def test_energies_of_any_episodes():
     rng = np.random.default_rng(0)
     for goal_dim in (2, 3, 6, 7, 15):
@@ -193,7 +185,7 @@ def test_herebp_draws_episodes_by_their_energy():
     speeds = np.array([0, 0.2, 0.5, 1])
     achieved = np.concatenate([path([v] * 5) for v in speeds])
     buffer, rng = stored(achieved), np.random.default_rng(0)
-    replay = HEREBP(buffer, 0.6, exact_reward, env_name="FetchPush-v1", dt=DT, temperature=3)
+    replay = HEREBP(buffer, env_name="FetchPush-v1", dt=DT, temperature=3)
     for slots in ([0, 1], [2, 3]):  # two collections
         replay.new_episodes(np.array(slots))
     energy = np.minimum(speeds**2 / 2, 0.5) + EPSILON
@@ -214,7 +206,7 @@ def test_herebp_draws_episodes_by_their_energy():
 
 
 def test_herebp_where_nothing_moves():
-    replay = HEREBP(stored(np.ones((3, 6, 3))), 0.8, exact_reward, env_name="FetchPush-v1", dt=DT)
+    replay = HEREBP(stored(np.ones((3, 6, 3))), env_name="FetchPush-v1", dt=DT)
     replay.new_episodes(np.arange(3))
     e = replay.sample(9_000, np.random.default_rng(0))["obs"][:, 0].astype(int) // 10
     assert_frequencies(np.bincount(e, minlength=3), np.full(3, 1 / 3))
@@ -259,13 +251,12 @@ def test_coverage_of_goals_that_are_equal():
     np.testing.assert_allclose(coverage(some)[0], expected)
 
 
-@pytest.mark.parametrize("faithful", [False, True])
-def test_cher_selects_like_a_brute_force_greedy(faithful):
+def test_cher_selects_like_a_brute_force_greedy():
     rng = np.random.default_rng(0)
     sets, m, k = 20, 9, 7
     goal, achieved = rng.normal(size=(2, sets, m, 3))
     proximity = rng.uniform(0.1, 2, sets)
-    chosen = select(goal, achieved, k, proximity, np.random.default_rng(1), faithful)
+    chosen = select(goal, achieved, k, proximity, np.random.default_rng(1))
 
     draws = np.random.default_rng(1)
     r = m - np.arange(k)
@@ -273,32 +264,25 @@ def test_cher_selects_like_a_brute_force_greedy(faithful):
     differs = 0
     for u in range(sets):
         neighbour, similarity = nearest_neighbours(goal[u])
-        remaining, taken, covering = list(range(m)), [], []
+        remaining, taken = list(range(m)), []
         for s in range(k):
             # the i-th draw counts among the places that the draws before it left free
             free = list(range(len(remaining)))
             trio = [remaining[free.pop(places[i][u, s])] for i in range(3)]
             best, best_value = None, -math.inf
-            counted = list(covering)
             for j in trio:
-                now = diversity([*counted, j], neighbour, similarity)
-                value = now - diversity(counted, neighbour, similarity)
+                now = diversity([*taken, j], neighbour, similarity)
+                value = now - diversity(taken, neighbour, similarity)
                 value -= proximity[u] * np.linalg.norm(goal[u, j] - achieved[u, j])
                 if value > best_value:
                     best, best_value = j, value
-                    if faithful:  # the original's leak: what leads for a moment stays covered
-                        counted.append(j)
             taken.append(best)
-            covering = counted if faithful else [*covering, best]
             place = remaining.index(best)
             remaining[place] = remaining[-1]
             remaining.pop()
         assert chosen[u].tolist() == taken
         differs += chosen[u].tolist() != sorted(chosen[u].tolist())
     assert differs
-    if faithful:
-        fixed = select(goal, achieved, k, proximity, np.random.default_rng(1))
-        assert (fixed != chosen).any()
 
 
 def test_cher_takes_the_best_of_three_different_ones():
@@ -324,8 +308,8 @@ def test_cher_weighs_proximity_more_and_more_and_starts_again(monkeypatch):
         return select(goal, achieved, selected, proximity, *rest)
 
     monkeypatch.setattr("baselines.cher.select", spy)
-    buffer = stored(numbered_episodes(4, 50)["achieved_goal"])
-    replay = CHER(buffer, 0.2, exact_reward, env_name="FetchPush-v1", heads=2, updates=6, at_once=4)
+    buffer = stored(numbered_episodes(4, 50)["achieved_goal"], ratio=0.2)
+    replay = CHER(buffer, env_name="FetchPush-v1", heads=2, updates=6, at_once=4)
     rng = np.random.default_rng(0)
     batches = [replay.sample(8, rng) for _ in range(16)]
     tau = [round(math.log(x) / math.log(1.0001)) for _, _, p in seen for x in p]
@@ -352,7 +336,7 @@ def test_cher_weighs_proximity_more_and_more_and_starts_again(monkeypatch):
 def test_rotation_tasks_look_at_the_orientation_alone(method):
     extra = {"heads": 1, "updates": 1} if method is CHER else {}
     for env_name in PAPER_ENVS:
-        replay = method(stored(np.ones((1, 6, 7))), 0.8, None, env_name=env_name, **extra)
+        replay = method(stored(np.ones((1, 6, 7))), env_name=env_name, **extra)
         assert replay.goal_part == slice(3 if "Rotate" in env_name else 0, None)
 
 
@@ -413,27 +397,13 @@ def test_k_dpp_of_goals_that_are_close_or_equal():
     close[1, 50:] = close[1, :50]
     close[2] = 0
     kernel = np.exp(-np.square(close[:, :, None] - close[:, None]).sum(axis=-1) / 0.5)
-    for faithful in (False, True):
-        items = sample_k_dpp(kernel, 64, rng, faithful)
-        assert all(len(set(s)) == 64 for s in items.tolist())
+    items = sample_k_dpp(kernel, 64, rng)
+    assert all(len(set(s)) == 64 for s in items.tolist())
     # with 50 pairs of equal goals, 48.7 of them on average, 43.6 by 64 drawn at random
     pairs = sample_k_dpp(np.repeat(kernel[1:2], 40, axis=0), 64, rng) % 50
     assert np.mean([len(set(p)) for p in pairs.tolist()]) > 48
     ones = sample_k_dpp(np.ones((20_000, 5, 5)), 2, rng)
     assert_frequencies(np.bincount(ones.reshape(-1), minlength=5), np.full(5, 0.2))
-
-
-def test_the_faithful_k_dpp_is_that_of_the_largest_eigenvectors():
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=(6, 2))
-    kernel = np.exp(-np.square(x[:, None] - x[None]).sum(axis=-1) / 2)
-    largest = np.linalg.eigh(kernel)[1][:, -2:]
-    subsets = list(itertools.combinations(range(6), 2))
-    probabilities = [np.linalg.det(largest[list(s)]) ** 2 for s in subsets]
-    drawn = sample_k_dpp(np.tile(kernel, (40_000, 1, 1)), 2, rng, faithful=True)
-    index = {s: i for i, s in enumerate(subsets)}
-    counts = np.bincount([index[tuple(sorted(s))] for s in drawn.tolist()], minlength=len(index))
-    assert_frequencies(counts, probabilities)
 
 
 def test_dtgsh_draws_episodes_by_their_diversity(monkeypatch):
@@ -447,7 +417,7 @@ def test_dtgsh_draws_episodes_by_their_diversity(monkeypatch):
         return np.tile(np.arange(k), (len(kernel), 1))
 
     monkeypatch.setattr("baselines.dtgsh.sample_k_dpp", first)
-    replay = DTGSH(buffer, 0.6, exact_reward, env_name="PointMassEmptyEnv-v1", at_once=400)
+    replay = DTGSH(buffer, env_name="PointMassEmptyEnv-v1", at_once=400)
     for slots in ([0, 1], [2, 3]):  # two collections
         replay.new_episodes(np.array(slots))
     rng = np.random.default_rng(0)
@@ -467,7 +437,7 @@ def test_dtgsh_draws_episodes_by_their_diversity(monkeypatch):
 
 
 def test_dtgsh_where_nothing_moves():
-    replay = DTGSH(stored(np.ones((3, 6, 3))), 0.8, exact_reward, env_name="FetchPush-v1")
+    replay = DTGSH(stored(np.ones((3, 6, 3))), env_name="FetchPush-v1")
     replay.new_episodes(np.arange(3))
     batch = replay.sample(64, np.random.default_rng(0))
     assert len(set(batch["obs"][:, 0])) == 3 and np.isfinite(batch["reward"]).all()
@@ -480,9 +450,9 @@ def test_limits_of_the_originals():
         ("HandReach-v0", 0.1, math.inf),
         ("Reacher-v2", 0.5, math.inf),
     ):
-        replay = DTGSH(stored(one), 0.8, None, env_name=name)
+        replay = DTGSH(stored(one), env_name=name)
         assert (replay.sigma, replay.most) == (sigma, most)
-        replay = HEREBP(stored(one), 0.8, None, env_name=name, dt=DT)
+        replay = HEREBP(stored(one), env_name=name, dt=DT)
         assert replay.exponent == 1 / 1.01
         assert replay.settings[1] == {"F": 0.5, "H": 2.5}.get(name[0], math.inf)
 
@@ -494,23 +464,21 @@ def test_limits_of_the_originals():
 def test_every_method_in_each_of_the_sixteen(name):
     task, rng = examine(name), np.random.default_rng(0)
     dims = (task.obs_dim, task.goal_dim, task.action_dim)
-    agent = EnsembleDDPG(*dims, gamma=0.98, heads=1)
-    buffer = EpisodeBuffer(1000, 50, *dims)
+    agent = EnsembleDDPG(*dims, gamma=0.98, num_heads=1)
+    buffer = EpisodeBuffer(1000, 50, *dims, 0.8, task.reward_fn)
     with ParallelEnvs(name, 2, 1) as envs:
         envs.reset(0)
         episodes, _ = run.rollout(envs, lambda *_: rng.uniform(-1, 1, (2, task.action_dim)), 50)
     slots = buffer.add(episodes, rng)
     for method in OTHERS:
-        for faithful in (False, True):
-            config = settings.complete(Config(env=name, method=method, updates=4, heads=1))
-            config.faithful = faithful
-            replay = make_replay(config, task, buffer)
-            replay.new_episodes(slots)
-            batch = replay.sample(64, rng)
-            assert {x.shape[0] for x in batch.values()} == {64}
-            assert all(np.isfinite(x).all() for x in batch.values())
-            assert set(np.unique(batch["reward"])) <= {-1.0, 0.0}
-            assert agent.update_head(0, batch).isfinite().all()
+        config = settings.complete(Config(env=name, method=method, updates=4, heads=1))
+        replay = make_replay(config, task, buffer)
+        replay.new_episodes(slots)
+        batch = replay.sample(64, rng)
+        assert {x.shape[0] for x in batch.values()} == {64}
+        assert all(np.isfinite(x).all() for x in batch.values())
+        assert set(np.unique(batch["reward"])) <= {-1.0, 0.0}
+        assert agent.update_head(0, batch).isfinite().all()
 
 
 def tiny(method, heads, **others):
@@ -546,12 +514,13 @@ def test_a_resumed_run_of_every_method_equals_an_uninterrupted_one(method, tmp_p
 def test_the_heads_get_mini_batches_of_their_own(tmp_path, monkeypatch):
     batches = []
 
-    def spy(self, k, batch, step):
-        batches.append((k, batch["obs"].tobytes()))
-        return update(self, k, batch, step)
+    def spy(self, heads, drawn):
+        pairs = zip(heads, drawn, strict=True)
+        batches.extend((k, batch["obs"].tobytes()) for k, batch in pairs)
+        return update(self, heads, drawn)
 
-    update = EnsembleDDPG.update_head
-    monkeypatch.setattr(EnsembleDDPG, "update_head", spy)
+    update = EnsembleDDPG.update_heads
+    monkeypatch.setattr(EnsembleDDPG, "update_heads", spy)
     for method in OTHERS:
         batches.clear()
         train(Config(**tiny(method, 3), out=str(tmp_path / method)))

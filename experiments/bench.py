@@ -99,7 +99,7 @@ def bench_update(repeats: int, heads: int = 16) -> None:
     )
     for name, (obs_dim, goal_dim, action_dim) in SIZES.items():
         for batch in (64, 256):
-            agent = EnsembleDDPG(obs_dim, goal_dim, action_dim, gamma=0.98, heads=heads)
+            agent = EnsembleDDPG(obs_dim, goal_dim, action_dim, gamma=0.98, num_heads=heads)
             data = random_batch(batch, obs_dim, goal_dim, action_dim)
             operands = [
                 (torch.randn(m, k), torch.randn(k, n), torch.empty(m, n))
@@ -139,8 +139,8 @@ def bench_collection(repeats: int, num_envs: int = 16, horizon: int = 50) -> Non
         raw_actions = rng.uniform(-1, 1, (horizon, action_dim)).astype(np.float32)
 
         def play(agent=agent, rng=rng, shape=(horizon, num_envs, action_dim)):
-            policy = run.exploring(run.greedy(agent, 16, num_envs), rng, shape, 0.2, 0.3)
-            run.rollout(envs, policy, horizon)
+            noise = run.exploration(rng, shape, 0.2, 0.3)
+            run.rollout(envs, run.acting_heads(agent, 16, num_envs, noise), horizon)
 
         def raw(env=env, actions=raw_actions):
             env.reset()
@@ -160,7 +160,8 @@ def bench_collection(repeats: int, num_envs: int = 16, horizon: int = 50) -> Non
 def full_buffer(name: str, rng: np.random.Generator, transitions: int = 100_000) -> EpisodeBuffer:
     """B_o with random observations and achieved goals that walk at random."""
     obs_dim, goal_dim, action_dim = SIZES[name]
-    buffer = EpisodeBuffer(transitions, 50, obs_dim, goal_dim, action_dim)
+    dims = (obs_dim, goal_dim, action_dim)
+    buffer = EpisodeBuffer(transitions, 50, *dims, 0.8, examine(name).reward_fn)
     n = buffer.capacity
     walk = rng.normal(0, 0.01, (n, 51, goal_dim)).cumsum(axis=1)
     episodes = {
@@ -171,12 +172,6 @@ def full_buffer(name: str, rng: np.random.Generator, transitions: int = 100_000)
     }
     buffer.add({k: x.astype(np.float32) for k, x in episodes.items()}, rng)
     return buffer
-
-
-def replay_of(config: Config, original: EpisodeBuffer):
-    """What the run would draw from, and its reward function."""
-    task = examine(config.env)
-    return make_replay(config, task, original), task.reward_fn
 
 
 @contextmanager
@@ -202,10 +197,10 @@ def bench_algorithm_1(repeats: int, heads: int = 16) -> None:
     print(f"{'ms, sizes of':14} {heading}  beside by left out, by in turn")
     for name in ("FetchPush-v1", "HandReach-v0"):
         size, rng = 256, np.random.default_rng(0)
-        agent = EnsembleDDPG(*SIZES[name], gamma=0.98, heads=heads)
+        agent = EnsembleDDPG(*SIZES[name], gamma=0.98, num_heads=heads)
         original = full_buffer(name, rng)
-        her_buffer, reward_fn = replay_of(complete(Config(env=name, heads=heads)), original)
-        how = (heads * size, np.random.default_rng(1), 0.8, reward_fn)
+        her_buffer = make_replay(complete(Config(env=name, heads=heads)), examine(name), original)
+        how = (heads * size, np.random.default_rng(1))
         while her_buffer.size < her_buffer.capacity:
             update_her_buffer(her_buffer, original, agent.q_variance, *how)
 
@@ -214,7 +209,7 @@ def bench_algorithm_1(repeats: int, heads: int = 16) -> None:
                 agent.update_head(k, her_buffer.sample(256, rng))
 
         def beside(agent=agent, original=original, her_buffer=her_buffer, how=how, train=train):
-            scoring = thread.submit(score, original, agent.frozen_q_variance(), *how)
+            scoring = thread.submit(score, original, agent.snapshot_q_variance(), *how)
             train()
             her_buffer.add(*scoring.result())
             her_buffer.update_priorities()
@@ -283,12 +278,12 @@ def bench_draws(repeats: int, heads: int = 16) -> None:
     for name in SIZES:
         rng = np.random.default_rng(0)
         original = full_buffer(name, rng)
-        agent = EnsembleDDPG(*SIZES[name], gamma=0.98, heads=heads)
+        agent = EnsembleDDPG(*SIZES[name], gamma=0.98, num_heads=heads)
         for batch in (64, 256):
             replays, calls = {}, 40
             for method in METHODS[1:] if batch == 64 else METHODS[1:-1]:  # DTGSH: 64 alone
                 config = complete(Config(env=name, method=method, batch_size=batch))
-                replays[method], _ = replay_of(config, original)
+                replays[method] = make_replay(config, examine(name), original)
                 replays[method].new_episodes(np.arange(original.size))
             data = random_batch(batch, *SIZES[name])
             functions = {

@@ -51,8 +51,8 @@ def figure_3(config: Config) -> dict[str, np.ndarray]:
     agent, rng = its.agent, np.random.default_rng(0)
     with its.envs() as envs:
         envs.reset(1_000_000)
-        policy = run.exploring(run.greedy(agent, 16, 16), rng, (50, 16, 2), 0.2, 0.3)
-        episodes, _ = run.rollout(envs, policy, 50)
+        noise = run.exploration(rng, (50, 16, 2), 0.2, 0.3)
+        episodes, _ = run.rollout(envs, run.acting_heads(agent, 16, 16, noise), 50)
     length = np.linalg.norm(np.diff(episodes["obs"], axis=1), axis=-1).sum(axis=1)
     rows = np.argsort(-length)[:TRAJECTORIES]  # those that move most
     t = rng.integers(50, size=TRAJECTORIES)

@@ -49,13 +49,11 @@ def drawn(its: Parts, method: str, rng: np.random.Generator) -> dict[str, np.nda
     """What `method` draws from the run's B_o, with the batch and the B_h of Appendix B's larger
     tasks: reward, hindsight and weight, (BATCHES·B,) each."""
     schedule = settings.paper_schedule("FetchPush-v1", method)
-    own = {"heads": its.config.heads, "relabel_ratio": its.config.relabel_ratio}
-    config = settings.complete(Config(its.config.env, method, **own, **schedule))
+    config = settings.complete(Config(its.config.env, method, heads=its.config.heads, **schedule))
     replay = make_replay(config, its.task, its.original_buffer)
     if method == "vcp":
-        how = (its.agent.q_variance, SCORED, rng, config.relabel_ratio, its.task.reward_fn)
         for _ in range(replay.capacity // SCORED):
-            update_her_buffer(replay, its.original_buffer, *how)
+            update_her_buffer(replay, its.original_buffer, its.agent.q_variance, SCORED, rng)
     else:
         replay.new_episodes(np.arange(its.original_buffer.size))
     batches = [replay.sample(config.batch_size, rng) for _ in range(BATCHES)]
@@ -93,7 +91,7 @@ def hidden(net: MultiHeadMLP, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tens
     """Where the trunk ends, (1, B, H), and the heads' hidden layers, (K, B, H), for x (B, I)."""
     w1, b1, w2, b2 = net.trunk
     embedding = linear(linear(x, w1, b1).relu(), w2, b2).relu()
-    return embedding[None], linear(embedding, *net.heads[:2]).relu()
+    return embedding[None], linear(embedding, *net.stacks[:2]).relu()
 
 
 def dead_share(units: torch.Tensor) -> float:

@@ -207,6 +207,15 @@ def in_ray(runs: list[Config], cores: float, gpus: float, address: str | None) -
     return failed
 
 
+class Stopped(BaseException):
+    """By a signal. Not SystemExit, which an environment may raise too; nor KeyboardInterrupt: where
+    one passes through exec(text), as in many an import, CPython kills `python -m` with SIGINT."""
+
+
+def stop(*_) -> None:
+    raise Stopped
+
+
 def epochs_done(config: Config) -> int:
     return records.epochs_done(Path(config.out))
 
@@ -269,8 +278,9 @@ def main(argv: Iterable[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    # not KeyboardInterrupt: if one passes through exec(text), as in many an import, CPython kills
-    # `python -m` with SIGINT, whatever its exit code was to be
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: sys.exit("sweep.py: stopped; the same command goes on"))
-    main()
+        signal.signal(number, stop)
+    try:
+        main()
+    except Stopped:
+        sys.exit("sweep.py: stopped; the same command goes on")

@@ -114,7 +114,13 @@ def assemble(config: Config) -> Parts:
     num_envs = number_of_envs(config)
     agent = make_agent(config, task)
     original_buffer = EpisodeBuffer(
-        config.buffer_size, task.horizon, task.obs_dim, task.goal_dim, task.action_dim
+        config.buffer_size,
+        task.horizon,
+        task.obs_dim,
+        task.goal_dim,
+        task.action_dim,
+        config.relabel_ratio,
+        task.reward_fn,
     )
     replay = make_replay(config, task, original_buffer)
     her_buffer = replay if config.method == "vcp" else None
@@ -128,7 +134,7 @@ def make_agent(config: Config, task: Task) -> EnsembleDDPG:
         obs_dim=task.obs_dim,
         goal_dim=task.goal_dim,
         action_dim=task.action_dim,
-        heads=config.heads,
+        num_heads=config.heads,
         gamma=1 - 1 / task.horizon,
         learning_rate=config.learning_rate,
         polyak=config.polyak,
@@ -154,15 +160,15 @@ def make_replay(
         )
     drawn = config.updates * config.heads  # mini-batches in a cycle
     at_once = max(n for n in range(1, 41) if drawn % n == 0)
-    her = (original_buffer, config.relabel_ratio, task.reward_fn)
     if config.method == "her":
-        return HERReplay(*her, at_once=at_once)
-    common = {"env_name": config.env, "faithful": config.faithful, "at_once": at_once}
+        return HERReplay(original_buffer, at_once=at_once)
+    common = {"env_name": config.env, "at_once": at_once}
     if config.method == "herebp":
-        return herebp.HEREBP(*her, **common, dt=task.dt)
+        return herebp.HEREBP(original_buffer, **common, dt=task.dt)
     if config.method == "cher":
-        return cher.CHER(*her, **common, heads=config.heads, updates=config.cycles * config.updates)
-    return dtgsh.DTGSH(*her, **common)
+        updates = config.cycles * config.updates
+        return cher.CHER(original_buffer, **common, heads=config.heads, updates=updates)
+    return dtgsh.DTGSH(original_buffer, **common)
 
 
 def restored(folder: Path) -> tuple[Parts, list[dict]]:

@@ -7,6 +7,7 @@ that they are made from, and are called in the same way; `assemble` takes them f
 """
 
 import threading
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -55,6 +56,7 @@ class HERBufferOnGPU(vcp.HERBuffer):
 
     def add(self, batch: Batch, variance: np.ndarray) -> None:
         """As `vcp.HERBuffer.add`; FloatingPointError for a variance that is NaN or Inf."""
+        variance = np.asarray(variance)
         rows, new = {**batch, "variance": variance}, len(variance)
         if variance.ndim != 1 or any(len(x) != new for x in rows.values()):
             raise ValueError(f"the variance is {variance.shape}, one number for each is needed")
@@ -107,8 +109,7 @@ class EnsembleOnGPU(EnsembleDDPG):
         super().__init__(*sizes, **settings)
         self._player = EnsembleDDPG(*sizes, **{**settings, "device": "cpu"})
         self._lock = threading.Lock()
-        self._waiting: list[tuple[int, Batch]] = []  # heads and mini-batches without a step so far
-        self._returned = self._batch = None
+        self._batch = None
         self._begin()
 
     def _begin(self) -> None:
@@ -127,31 +128,17 @@ class EnsembleOnGPU(EnsembleDDPG):
             now = (self._steps, self.normalizer.count)
             if self._followed != now:
                 here, there = self.actor, self._player.actor
-                for p, q in zip(there.trunk + there.heads, here.trunk + here.heads, strict=True):
+                for p, q in zip(there.trunk + there.stacks, here.trunk + here.stacks, strict=True):
                     p.copy_(q)
                 self._player.normalizer.mean.copy_(self.normalizer.mean)
                 self._player.normalizer.std.copy_(self.normalizer.std)
                 self._followed = now
         return self._player.act(obs, goal, heads)
 
-    def update_head(self, k: int, batch: Batch, step: bool = True) -> torch.Tensor:
-        """As `EnsembleDDPG.update_head`, but the losses are in what it returns after the step."""
-        if not self._waiting:
-            self._returned = torch.empty((self.heads, 2), device=self.device)
-        self._waiting.append((k, batch))
-        losses = self._returned[k]
-        if step:
-            waiting, self._waiting = self._waiting, []
-            if [j for j, _ in waiting] == list(range(self.heads)):
-                self._returned.copy_(self._all_heads([batch for _, batch in waiting]).T)
-            else:
-                for i, (j, its) in enumerate(waiting, start=1):
-                    self._returned[j] = super().update_head(j, its, step=i == len(waiting))
-            self._steps += 1
-        return losses
-
-    def _all_heads(self, batches: list[Batch]) -> torch.Tensor:
-        """A step of all heads, each with its mini-batch. Returns the losses, (2, K)."""
+    def update_heads(self, heads: Sequence[int], batches: list[Batch]) -> torch.Tensor:
+        self._steps += 1
+        if [*heads] != [*range(self.num_heads)]:
+            return super().update_heads(heads, batches)
         rows = {
             name: torch.stack([torch.as_tensor(batch[name]) for batch in batches])
             for name in ("obs", "action", "next_obs", "goal", "reward", "weight")
@@ -161,18 +148,25 @@ class EnsembleOnGPU(EnsembleDDPG):
         for name, x in rows.items():
             self._batch[name].copy_(x)
         if self.device.type == "cpu":  # in tests
-            return super().update_head(slice(None), self._batch)
-        if self._steps < WARM_UP:
+            return self._all_heads().T
+        if self._steps <= WARM_UP:
             stream = torch.cuda.Stream()
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
-                losses = super().update_head(slice(None), self._batch)
+                losses = self._all_heads()
             torch.cuda.current_stream().wait_stream(stream)
-            return losses
+            return losses.T
         if self._graph is None:
             self._graph = torch.cuda.CUDAGraph()
             # Algorithm 1's thread goes on meanwhile
             with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
-                self._captured_losses = super().update_head(slice(None), self._batch)
+                self._captured_losses = self._all_heads()
         self._graph.replay()
-        return self._captured_losses
+        return self._captured_losses.T.clone()
+
+    def _all_heads(self) -> torch.Tensor:
+        """A step of all heads in one pass, each with its rows of `_batch`. Returns (2, K)."""
+        losses = self._losses(slice(None), self._batch)
+        losses.sum().backward()
+        self._step()
+        return losses.detach()

@@ -47,16 +47,16 @@ def play(source: Path, gif: str | None = None, policy: str | None = None) -> np.
         try_to_draw(about)
     env = make_env(about["env"], about["episode_length"])
     seeds = range(SEED, SEED + EPISODES)
-    rates = np.zeros(agent.heads)
-    for head in tqdm(range(agent.heads), desc="heads", leave=False, disable=None):
+    rates = np.zeros(agent.num_heads)
+    for head in tqdm(range(agent.num_heads), desc="heads", leave=False, disable=None):
         rates[head] = np.mean([episode(env, agent, head, seed)[0] for seed in seeds])
     env.close()
     best = int(rates.argmax())
     print(
         f"{about['env']} after epoch {about['epoch']}: success {rates.mean():.3f} over"
-        f" {agent.heads * EPISODES} episodes"
+        f" {agent.num_heads * EPISODES} episodes"
     )
-    if agent.heads > 1:
+    if agent.num_heads > 1:
         print(f"by head: {' '.join(f'{rate:.1f}' for rate in rates)}; the best is {best}")
     if policy:
         write_policy(Path(policy), agent, best, about)
@@ -171,7 +171,7 @@ def read_policy(path: Path) -> tuple[EnsembleDDPG, dict]:
         about = json.loads(str(arrays.pop("about")))
         env = make_env(about["env"], about["episode_length"])
         sizes = [env.observation_space[name].shape[0] for name in ("observation", "desired_goal")]
-        agent = EnsembleDDPG(*sizes, *env.action_space.shape, gamma=0.98, heads=1)
+        agent = EnsembleDDPG(*sizes, *env.action_space.shape, gamma=0.98, num_heads=1)
         env.close()
         its = {f"p{i}": p for i, p in enumerate(agent.actor.parameters())}
         its |= {name: getattr(agent.normalizer, name) for name in ("mean", "std")}

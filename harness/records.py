@@ -8,14 +8,11 @@ stands in the folder is whole: the last epoch's or the one before.
 import csv
 import io
 import json
-import math
 import os
 import platform
 import shlex
 import subprocess
-import time
 import zipfile
-from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -24,7 +21,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from filelock import FileLock, Timeout
-from tqdm import tqdm
 
 from harness.errors import FolderInUse, UsageError
 
@@ -50,78 +46,6 @@ PACKAGES = ("numpy", "torch", "gymnasium", "gymnasium-robotics", "mujoco")
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
 FORMAT = 4  # of checkpoints; others are refused
 MAY_CHANGE = ("epochs", "out", "device", "num_workers", "tensorboard")  # when a run is resumed
-
-tqdm.monitor_interval = 0  # its watching thread would outlive a run
-
-
-# ------------------------------------------------------------------------------ an epoch
-
-
-class Notes:
-    """What an epoch's row of progress.csv is made from, and the bar that shows how far it is."""
-
-    def __init__(self, epoch: int, epochs: int, rounds: int):
-        self.epoch, self.epochs = epoch, epochs
-        self.seconds: dict[str, float] = defaultdict(float)
-        self.successes: list[np.ndarray] = []  # of training episodes, (N,) a cycle
-        self.losses: list[torch.Tensor] = []  # of critic and actor, (2,) an update
-        self.originals: list[float] = []  # their share in each mini-batch
-        # disable=None: no bar where the output is not a terminal
-        self.bar = tqdm(desc=f"epoch {epoch}/{epochs}", total=rounds, leave=False, disable=None)
-
-    @contextmanager
-    def timed(self, name: str) -> Iterator[None]:
-        """Add the wall time of the block to `seconds`, and a step to the bar."""
-        start = time.perf_counter()
-        yield
-        self.seconds[name] += time.perf_counter() - start
-        self.bar.update()
-
-    def row(self, env_steps: int, test: tuple[float, float], agent, replay, began: float) -> dict:
-        """The row. test: success rate and mean Q. FloatingPointError for NaN or Inf in a loss."""
-        self.bar.close()
-        critic_loss, actor_loss = torch.stack(self.losses).mean(dim=0).tolist()
-        if not math.isfinite(critic_loss + actor_loss):
-            raise FloatingPointError(f"NaN or Inf in the losses of epoch {self.epoch}")
-        return {
-            "epoch": self.epoch,
-            "env_steps": env_steps,
-            "wall_seconds": time.perf_counter() - began,
-            "test_success_rate": test[0],
-            "train_success_rate": float(np.mean(self.successes)),
-            "test_q": test[1],
-            "critic_loss": critic_loss,
-            "actor_loss": actor_loss,
-            **variance_by_kind(agent, replay),
-            "batch_original_fraction": float(sum(self.originals) / len(self.originals)),
-            "her_buffer_size": replay.size,
-            **{f"{name}_seconds": value for name, value in self.seconds.items()},
-        }
-
-    def write(self, row: dict) -> None:
-        """Print the row in fewer than 80 columns."""
-        tqdm.write(
-            f"epoch {self.epoch:{len(str(self.epochs))}}/{self.epochs}  {row['env_steps']:7d} steps"
-            f"  success {row['test_success_rate']:.3f} (training {row['train_success_rate']:.3f})"
-            f"  {row['wall_seconds']:.0f} s"
-        )
-
-
-def variance_by_kind(agent, replay, most: int = 4096) -> dict[str, float]:
-    """Figure 4: the mean variance of the critics as they are on the hindsight and the original
-    transitions of B_h or, without VCP, of what was drawn last; from about `most` of them, evenly
-    spread."""
-    every = slice(None, replay.size, max(1, replay.size // most))
-    rows = {name: torch.as_tensor(x[every]).cpu().numpy() for name, x in replay.data.items()}
-    variance = agent.q_variance(rows["obs"], rows["action"], rows["goal"])
-    kinds = {"hindsight": rows["hindsight"], "original": ~rows["hindsight"]}
-    return {
-        f"variance_{name}": float(variance[kind].mean()) if kind.any() else math.nan
-        for name, kind in kinds.items()
-    }
-
-
-# ------------------------------------------------------------------------------ the folder
 
 
 def to_type(option: str, folder: Path) -> str:
@@ -160,12 +84,9 @@ def read_config(folder: Path) -> dict:
 
 
 @contextmanager
-def held(folder: Path, config: dict, parts: tuple, resume: bool) -> Iterator[list[dict]]:
-    """The run's folder, this process's alone in the block, and the rows so far. It is made, or with
-    `resume` both it and the parts are brought to the state of its checkpoint; a finished run's
-    config.json keeps the commit and versions that made it. UsageError if the folder holds a run
-    that is not resumed, if another process has it, or if it cannot be written to; and that of
-    `restore`."""
+def held(folder: Path, resume: bool) -> Iterator[None]:
+    """Make the run's folder, this process's alone in the block. UsageError if it holds a run that
+    is not resumed, if another process has it, or if it cannot be written to."""
     lock = FileLock(folder / ".lock", timeout=0)  # any death of the process releases it
     try:
         _refuse_another(folder, resume)
@@ -177,13 +98,20 @@ def held(folder: Path, config: dict, parts: tuple, resume: bool) -> Iterator[lis
         raise UsageError(f"cannot write to {folder}: {error.strerror or error}") from error
     try:
         _refuse_another(folder, resume)  # one that was faster
-        rows = restore(folder, config, parts) if resume else []
-        if len(rows) < config["epochs"]:
-            write_config(folder, config)
-        write_rows(folder, rows, config)
-        yield rows
+        yield
     finally:
         lock.release()
+
+
+def begin(folder: Path, config: dict, parts: tuple, resume: bool) -> list[dict]:
+    """The rows so far: none or, with `resume`, those of the checkpoint, to whose state the parts
+    are brought. A finished run's config.json keeps the commit and versions that made it. UsageError
+    as in `restore`."""
+    rows = restore(folder, config, parts) if resume else []
+    if len(rows) < config["epochs"]:
+        write_config(folder, config)
+    write_rows(folder, rows, config)
+    return rows
 
 
 def _refuse_another(folder: Path, resume: bool) -> None:
@@ -193,9 +121,18 @@ def _refuse_another(folder: Path, resume: bool) -> None:
 
 def save(folder: Path, config: dict, rows: list[dict], parts: tuple) -> None:
     """The end of an epoch: checkpoint.pt, then progress.csv and curve.png."""
-    states = [part.state_dict() for part in parts]
+    states = as_tensors([part.state_dict() for part in parts])
     save_checkpoint(folder, {"config": config, "rows": rows, "parts": states})
     write_rows(folder, rows, config)
+
+
+def as_tensors(state):
+    """A state with tensors for its arrays, as PyTorch reads no arrays without running code."""
+    if isinstance(state, dict):
+        return {name: as_tensors(x) for name, x in state.items()}
+    if isinstance(state, (list, tuple)):
+        return type(state)(map(as_tensors, state))
+    return torch.from_numpy(state) if isinstance(state, np.ndarray) else state
 
 
 def write_rows(folder: Path, rows: list[dict], config: dict) -> None:

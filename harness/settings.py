@@ -90,9 +90,6 @@ class Config:
     acting_head: str = setting(
         "all", COMPARISON, "the heads that collect episodes, Section 5.6", ["all", "one"]
     )
-    faithful: bool = setting(
-        False, COMPARISON, "herebp, cher, dtgsh with the flaws of their released code"
-    )
     device: str = setting(
         "auto",
         MACHINE,
@@ -149,8 +146,6 @@ def complete(config: Config) -> Config:
     for name in OF_VCP if method != "vcp" else ():
         if getattr(config, name) != getattr(Config, name):
             raise UsageError(f"{flag(name)} goes with --method vcp, not with {method}")
-    if config.faithful and method in ("vcp", "her"):
-        raise UsageError(f"--faithful does not go with --method {method}")
     if method == "cher" and config.batch_size < 2:
         raise UsageError("--method cher selects from twice the batch: --batch-size 2 or more")
     if method == "vcp":
@@ -230,8 +225,10 @@ def default_folder(config: Config) -> str:
 def load(folder: Path) -> Config:
     """The settings of the run in `folder`. UsageError if it holds none, or another version's."""
     try:
-        return Config(**records.read_config(folder))
-    except TypeError as error:
+        saved = records.read_config(folder)
+        saved.pop("faithful", None)  # an option of earlier runs, off in all that are kept
+        return Config(**saved)
+    except (TypeError, AttributeError) as error:
         raise UsageError(f"{folder} holds a run of another version ({error})") from error
 
 

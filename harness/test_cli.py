@@ -146,7 +146,6 @@ BAD = [
     ("--method herebp --her-buffer-capacity 99999", "--her-buffer-capacity goes with --method vcp"),
     ("--method cher --temperature 5", "--temperature goes with --method vcp"),
     ("--method cher --batch-size 1", "--batch-size 2 or more"),
-    ("--method her --faithful", "--faithful does not go with --method her"),
     ("--importance yes", "--importance"),
     ("--acting-head none", "--acting-head"),
     ("--device tpu", "--device"),

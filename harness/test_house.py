@@ -84,16 +84,26 @@ from her import EpisodeBuffer
 from ensemble import EnsembleDDPG
 from vcp import HERBuffer, update_her_buffer
 rng = np.random.default_rng(0)
-original_buffer, her_buffer = EpisodeBuffer(100, 10, 3, 2, 2), HERBuffer(500, 9.0)
+reward_fn = lambda a, b: -1.0 * (np.linalg.norm(a - b, axis=-1) > 0.1)
+original_buffer = EpisodeBuffer(100, 10, 3, 2, 2, 0.8, reward_fn)
+her_buffer = HERBuffer(500, 9.0)
 shapes = {"obs": (4, 11, 3), "achieved_goal": (4, 11, 2), "desired_goal": (4, 2)}
 shapes["action"] = (4, 10, 2)
 original_buffer.add({name: rng.normal(size=shape) for name, shape in shapes.items()}, rng)
-agent = EnsembleDDPG(3, 2, 2, gamma=0.9, heads=4)
-reward_fn = lambda a, b: -1.0 * (np.linalg.norm(a - b, axis=-1) > 0.1)
-update_her_buffer(her_buffer, original_buffer, agent.q_variance, 300, rng, 0.8, reward_fn)
+agent = EnsembleDDPG(3, 2, 2, gamma=0.9, num_heads=4)
+update_her_buffer(her_buffer, original_buffer, agent.q_variance, 300, rng)
 print(agent.update_head(2, her_buffer.sample(64, rng)).isfinite().all().item())
 """
     assert python(program, tmp_path) == "True\n"
+
+
+def test_eq_4_and_the_buffers_need_numpy_alone(tmp_path):
+    for name in ("vcp", "her"):
+        shutil.copy(HERE / f"{name}.py", tmp_path)
+    program = (
+        "import sys\nsys.modules['torch'] = None\nimport vcp\nprint(vcp.HERBuffer(9, 1.0).size)"
+    )
+    assert python(program, tmp_path) == "0\n"
 
 
 def test_a_runs_folder_is_read_without_mujoco_and_matplotlib():

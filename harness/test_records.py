@@ -23,7 +23,7 @@ import torch
 from filelock import FileLock, Timeout
 
 import run
-from harness import records
+from harness import epoch, records
 from harness.assemble import restored
 from harness.errors import EnvironmentFailed
 from harness.records import read_rows
@@ -60,15 +60,15 @@ def test_the_variances_are_of_a_part_of_what_is_stored():
     data = {"obs": rows, "action": rows, "goal": rows, "hindsight": rows[:, 0] % 20 == 0}
     seen = []
     agent = SimpleNamespace(q_variance=lambda obs, *_: (seen.append(obs), obs[:, 0])[1])
-    variance = records.variance_by_kind(agent, SimpleNamespace(data=data, size=1000), most=100)
+    variance = epoch.variance_by_kind(agent, SimpleNamespace(data=data, size=1000), most=100)
     np.testing.assert_array_equal(seen[0][:, 0], np.arange(0, 1000, 10))
     assert variance == {"variance_hindsight": 490, "variance_original": 500}
 
 
 def test_the_seconds_of_an_epoch_are_added_up(monkeypatch):
     clock = itertools.count(step=3)
-    monkeypatch.setattr(records.time, "perf_counter", lambda: next(clock))
-    notes = records.Notes(1, 1, 1)
+    monkeypatch.setattr(epoch.time, "perf_counter", lambda: next(clock))
+    notes = epoch.Epoch(1, 1, 1)
     for name in ("train", "eval", "train"):
         with notes.timed(name):
             pass

@@ -116,22 +116,20 @@ def test_one_cycle_of_each_of_the_sixteen(name):
         "Reach": (8, 2, 2),
         "Point": (2, 2, 2),
     }[name[:5]] or name == "FetchReach-v1"
-    agent = EnsembleDDPG(obs_dim, goal_dim, action_dim, gamma=0.98, heads=2)
+    agent = EnsembleDDPG(obs_dim, goal_dim, action_dim, gamma=0.98, num_heads=2)
     rng = np.random.default_rng(0)
     with ParallelEnvs(name, 2, 1) as envs:
         envs.reset(0)
-        policy = run.exploring(run.greedy(agent, 2, 2), rng, (50, 2, action_dim), 0.2, 0.3)
+        noise = run.exploration(rng, (50, 2, action_dim), 0.2, 0.3)
+        policy = run.acting_heads(agent, 2, 2, noise)
         episodes, success = run.rollout(envs, policy, 50)
     assert episodes["obs"].shape == (2, 51, obs_dim) and success.shape == (2,)
     assert episodes["achieved_goal"].shape == (2, 51, goal_dim)
-    original = EpisodeBuffer(1000, 50, obs_dim, goal_dim, action_dim)
+    dims = (obs_dim, goal_dim, action_dim)
+    original = EpisodeBuffer(1000, 50, *dims, 0.8, env.compute_reward)
     original.add(episodes, rng)
     buffer = HERBuffer(256, 9.0)
-
-    def reward_fn(achieved, desired):
-        return env.unwrapped.compute_reward(achieved, desired, {})
-
-    update_her_buffer(buffer, original, agent.q_variance, 256, rng, 0.8, reward_fn)
+    update_her_buffer(buffer, original, agent.q_variance, 256, rng)
     rewards = buffer.data["reward"]
     assert set(np.unique(rewards)) == {-1.0, 0.0} and rewards.dtype == np.float32
     for k in range(2):

@@ -19,13 +19,14 @@ def test_workers_play_the_same_as_one_process(name):
     env = make_env(name)
     obs_dim, goal_dim = (env.observation_space[k].shape[0] for k in ("observation", "desired_goal"))
     action_dim = env.action_space.shape[0]
-    agent = random_agent(heads=4, obs_dim=obs_dim, goal_dim=goal_dim, action_dim=action_dim)
+    agent = random_agent(num_heads=4, obs_dim=obs_dim, goal_dim=goal_dim, action_dim=action_dim)
     for workers in (1, 2, 4):
         with ParallelEnvs(name, 8, workers) as envs:
             assert envs.num_workers == workers
             envs.reset(7)
             rng = np.random.default_rng(0)
-            policy = run.exploring(run.greedy(agent, 4, 8), rng, (5, 8, action_dim), 0.2, 0.3)
+            noise = run.exploration(rng, (5, 8, action_dim), 0.2, 0.3)
+            policy = run.acting_heads(agent, 4, 8, noise)
             episodes, _ = run.rollout(envs, policy, 5)
             played.append(episodes)
     for key, array in played[0].items():
@@ -50,7 +51,7 @@ def test_workers_hold_whole_heads_or_a_part_of_one():
             "PointMassEmptyEnv-v1", num_envs, whole_heads(asked, num_envs, heads)
         ) as envs:
             assert envs.num_workers == made
-            rows = [np.arange(num_envs)[worker.rows] for worker in envs.workers]
+            rows = [np.arange(num_envs)[worker.envs] for worker in envs.workers]
             np.testing.assert_array_equal(np.concatenate(rows), np.arange(num_envs))
 
 

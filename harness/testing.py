@@ -54,13 +54,15 @@ def exact_reward(achieved, desired):
     return np.where((achieved == desired).all(axis=-1), 0.0, -1.0)
 
 
-def random_agent(heads=16, seed=0, obs_dim=5, goal_dim=3, action_dim=2, **kwargs):
+def random_agent(num_heads=16, seed=0, obs_dim=5, goal_dim=3, action_dim=2, **kwargs):
     """An agent with biases other than 0, targets unlike the networks, and statistics."""
-    agent = EnsembleDDPG(obs_dim, goal_dim, action_dim, gamma=0.9, heads=heads, seed=seed, **kwargs)
+    agent = EnsembleDDPG(
+        obs_dim, goal_dim, action_dim, gamma=0.9, num_heads=num_heads, seed=seed, **kwargs
+    )
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for net in (agent.actor, agent.critic, agent.target_actor, agent.target_critic):
-            for p in (*net.trunk, *net.heads):
+            for p in (*net.trunk, *net.stacks):
                 p.add_(0.05 * torch.randn(p.shape, generator=generator))
     rng = np.random.default_rng(seed)
     agent.normalizer.update(rng.normal(1, 2, (500, obs_dim + goal_dim)))

@@ -93,24 +93,24 @@ class EnvGroup(gym.Env):
 
 
 class Worker:
-    """The environments `rows` of all, in a process of their own, or in this one without `main`."""
+    """The environments `envs` of all, in a process of their own, or in this one without `main`."""
 
-    def __init__(self, name: str, make: MakeEnv, rows: slice, main: int | None, core: int | None):
-        self.name, self.rows = name, rows
-        group = partial(EnvGroup, make, rows.stop - rows.start, main, core)
+    def __init__(self, name: str, make: MakeEnv, envs: slice, main: int | None, core: int | None):
+        self.name, self.envs = name, envs
+        group = partial(EnvGroup, make, envs.stop - envs.start, main, core)
         vector = AsyncVectorEnv if main else SyncVectorEnv
         self._env = vector([group], copy=False, autoreset_mode=AutoresetMode.DISABLED)
 
     def reset(self, seed: int | None = None) -> dict[str, np.ndarray]:
         """Start an episode in each. With a seed, environment i of all is seeded with seed + i;
         without, it goes on with the random numbers it has. Returns float32 arrays of (n, ...)."""
-        seed = None if seed is None else [seed + self.rows.start]
-        return self._rows(self._ask(self._env.reset, seed=seed)[0])
+        seed = None if seed is None else [seed + self.envs.start]
+        return self._copies(self._ask(self._env.reset, seed=seed)[0])
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """One step in each: actions (n, A) in [-1, 1] -> observations, is_success (n,)."""
         obs, *_, info = self._ask(self._env.step, action[None])
-        return self._rows(obs), info["is_success"][0]
+        return self._copies(obs), info["is_success"][0]
 
     def close(self, now: bool) -> None:
         """now: without waiting for a step that may be under way."""
@@ -130,7 +130,7 @@ class Worker:
     def _processes(self):
         return getattr(self._env, "processes", [])
 
-    def _rows(self, obs):
+    def _copies(self, obs):
         return {name: x[0].copy() for name, x in obs.items()}
 
     def _ask(self, method, *args, **kwargs):
