@@ -17,6 +17,7 @@ import pytest
 import envs_point
 import run
 from ensemble import EnsembleDDPG
+from harness import records
 from harness.errors import EnvironmentFailed
 from harness.records import read_checkpoint
 from harness.testing import ARGUMENTS, HERE, SMALL, command, finish, main, start, wait_for_an_epoch
@@ -214,6 +215,7 @@ def test_bad_input_gets_one_line_and_exit_code_2(arguments, message, tmp_path, m
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").write_text(text)
     (tmp_path / "broken_module.py").write_text("def (")
+    monkeypatch.setattr(records, "begin", lambda *_: pytest.fail("it trains"))
     before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}
     ours = [] if "--resume" in arguments or "--play" in arguments else ["--env", SMALL["env"]]
     with pytest.raises(SystemExit) as stop:
