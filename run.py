@@ -44,7 +44,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     resume: go on with the run in config.out, after its last whole epoch. Everything random follows
     from (seed, epoch), so the rows are those of a run that was never stopped.
     UsageError, before anything is written, for a config that cannot be run; FloatingPointError
-    where NaN or Inf turns up.
+    where NaN or Inf turns up; EnvironmentFailed for what an environment does wrong later.
     """
     config = complete(config)
     folder = Path(config.out).absolute()  # an environment may change the working folder
@@ -58,11 +58,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     # + VCP+: one head steps after the other, or all at once (NOTES.md, "Heads in turn or at once")
     turns = np.arange(config.heads).reshape(-1, config.heads_at_once).tolist()
     test_rounds, began = math.ceil(config.eval_episodes / num_envs), time.perf_counter()
-    with (
-        parts.envs() as envs,
-        records.held(folder, resume),
-        ThreadPoolExecutor(1) as thread,
-    ):
+    with parts.envs() as envs, records.held(folder, resume), ThreadPoolExecutor(1) as thread:
         rows = records.begin(folder, asdict(config), parts.state(), resume)
         began -= rows[-1]["wall_seconds"] if rows else 0
         print(task.made)
@@ -102,9 +98,10 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                             critics, count = agent.snapshot_q_variance(), scored_a_sweep(config)
                             scored = thread.submit(score, original_buffer, critics, count, her_rng)
                         for heads in turns:  # 14: for each head
+                            # 15: a mini-batch of its own, from B_h
                             batches = [replay.sample(config.batch_size, draw_rng) for _ in heads]
-                            # 15: from B_h; 16: 𝔸
-                            epoch.note(agent.update_heads(heads, batches), batches)
+                            losses = agent.update_heads(heads, batches)  # 16: 𝔸
+                            epoch.note(losses, batches)
                         if vcp:  # 17: both are done; Algorithm 1, its lines 6-7
                             her_buffer.add(*scored.result())
                             her_buffer.update_priorities()

@@ -529,9 +529,9 @@ def test_updates_are_those_of_plain_ddpg(turns):
             pi = actors[k](state)
             actor_loss = -(weight * critics[k](state, pi)).mean() + 0.3 * (weight * pi**2).mean()
             for loss, net in ((critic_loss, critics[k]), (actor_loss, actors[k])):
-                its_params = [*net.parameters()]
-                its_gradients = torch.autograd.grad(loss, its_params, retain_graph=True)
-                for p, g in zip(its_params, its_gradients, strict=True):
+                params_k = [*net.parameters()]
+                gradients_k = torch.autograd.grad(loss, params_k, retain_graph=True)
+                for p, g in zip(params_k, gradients_k, strict=True):
                     p.grad = g if p.grad is None else p.grad + g
             expected.append(torch.stack([critic_loss, actor_loss]).detach())
         if len(together) == 1:

@@ -47,9 +47,9 @@ def trained(config: Config, epoch: int) -> Parts:
 def figure_3(config: Config) -> dict[str, np.ndarray]:
     """Section 5.3: the variance of a random state ŝ and its action with each achieved goal of its
     own trajectory. xy (5, T+1, 2); t (5,), the step of ŝ; variance (5, T+1)."""
-    its = trained(config, EPOCH)
-    agent, rng = its.agent, np.random.default_rng(0)
-    with its.envs() as envs:
+    parts = trained(config, EPOCH)
+    agent, rng = parts.agent, np.random.default_rng(0)
+    with parts.envs() as envs:
         envs.reset(1_000_000)
         noise = run.exploration(rng, (50, 16, 2), 0.2, 0.3)
         episodes, _ = run.rollout(envs, run.acting_heads(agent, 16, 16, noise), 50)
@@ -69,8 +69,8 @@ def figure_5(config: Config) -> dict[str, np.ndarray]:
     each stage."""
     points = {}
     for epoch in STAGES:
-        its = trained(config, epoch)
-        original, her_buffer = its.original_buffer, its.her_buffer
+        parts = trained(config, epoch)
+        original, her_buffer = parts.original_buffer, parts.her_buffer
         rng = np.random.default_rng(epoch)
         episodes = original.episodes
         e, t = rng.integers(original.size, size=SHOWN), rng.integers(50, size=SHOWN)
@@ -88,8 +88,8 @@ def figure_5(config: Config) -> dict[str, np.ndarray]:
 def figure_8(config: Config) -> dict[str, np.ndarray]:
     """Section 5.8: of every transition of B_h the variance now, the probability to be drawn, and
     whether it is hindsight's, (N,) each."""
-    its = trained(config, EPOCH)
-    agent, her_buffer = its.agent, its.her_buffer
+    parts = trained(config, EPOCH)
+    agent, her_buffer = parts.agent, parts.her_buffer
     rows = {name: x[: her_buffer.size] for name, x in her_buffer.data.items()}
     return {
         "variance": agent.q_variance(rows["obs"], rows["action"], rows["goal"]),
@@ -137,11 +137,11 @@ def draw_figure_3(data: dict[str, np.ndarray]) -> Figure:
     panels = fig.subplots(2, 3).flat
     colour = np.log10(data["variance"])
     limits = {"vmin": colour.min(), "vmax": colour.max(), "cmap": "viridis"}
-    for ax, xy, t, its, r in zip(
+    for ax, xy, t, variance, r in zip(
         panels, data["xy"], data["t"], colour, distance_correlation(data), strict=False
     ):
         ax.plot(*xy.T, color="0.8", linewidth=1, zorder=0)
-        points = ax.scatter(*xy.T, c=its, s=14, **limits)
+        points = ax.scatter(*xy.T, c=variance, s=14, **limits)
         ax.plot(*xy[0], "o", color=RED, markersize=7, label="start")
         ax.plot(*xy[-1], "s", color=BLUE, markersize=7, label="end")
         ax.plot(*xy[t], "k^", markersize=9, label="ŝ")
@@ -246,8 +246,8 @@ def main() -> None:
         parser.error(str(error))
     folder = RESULTS / "didactic"
     folder.mkdir(parents=True, exist_ok=True)
-    for name, its in arrays.items():  # after all runs, which note whether the work tree is clean
-        np.savez_compressed(folder / f"{name}.npz", **its)
+    for name, values in arrays.items():  # after all runs, which note whether the work tree is clean
+        np.savez_compressed(folder / f"{name}.npz", **values)
         print(folder / f"{name}.npz")
 
 

@@ -121,8 +121,8 @@ def interval(x: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 def said(x: np.ndarray) -> str:
     """The mean over seeds with its interval, or with the seeds' own numbers where they are few."""
     ends = interval(x)
-    its = "{:.3f}-{:.3f}".format(*ends) if ends else " ".join(f"{seed:.3f}" for seed in x)
-    return f"{x.mean():.3f} ({its})" if len(x) > 1 else f"{x.mean():.3f}"
+    spread = "{:.3f}-{:.3f}".format(*ends) if ends else " ".join(f"{seed:.3f}" for seed in x)
+    return f"{x.mean():.3f} ({spread})" if len(x) > 1 else f"{x.mean():.3f}"
 
 
 def draw_line(ax: Axes, seeds: list[np.ndarray], style: int, text: str, smooth: float) -> None:
@@ -160,7 +160,7 @@ def curves(runs: list[Run], title: str, smooth: float) -> Figure:
         by_env[run.config.env + schedule(run.config)][label(run.config)].append(
             run.rows["test_success_rate"]
         )
-    compared = {env: its for env, its in by_env.items() if len(its) > 1 and "VCP" in its}
+    compared = {env: runs for env, runs in by_env.items() if len(runs) > 1 and "VCP" in runs}
     by_env = compared or by_env
     columns = min(len(by_env), 3)
     lines = -(-len(by_env) // columns)

@@ -36,26 +36,28 @@ def effective_share(p: np.ndarray) -> float:
     return float(1 / (len(p) * np.square(p).sum()))
 
 
-def effective(its: Parts) -> list[str]:
+def effective(parts: Parts) -> list[str]:
     """A cell for each of the TEMPERATURES. UsageError for a run without B_h."""
-    if its.her_buffer is None:
-        raise UsageError(f"a run of --method {its.config.method} has no B_h")
-    data = {name: x[: its.her_buffer.size] for name, x in its.her_buffer.data.items()}
+    if parts.her_buffer is None:
+        raise UsageError(f"a run of --method {parts.config.method} has no B_h")
+    data = {name: x[: parts.her_buffer.size] for name, x in parts.her_buffer.data.items()}
     priorities = [value_consistency_priority(data["variance"], t) for t in TEMPERATURES]
     return [f"{effective_share(p):.1%}; {p[~data['hindsight']].sum():.1%}" for p in priorities]
 
 
-def drawn(its: Parts, method: str, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def drawn(parts: Parts, method: str, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """What `method` draws from the run's B_o, with the batch and the B_h of Appendix B's larger
     tasks: reward, hindsight and weight, (BATCHES·B,) each."""
     schedule = settings.paper_schedule("FetchPush-v1", method)
-    config = settings.complete(Config(its.config.env, method, heads=its.config.heads, **schedule))
-    replay = make_replay(config, its.task, its.original_buffer)
+    config = settings.complete(
+        Config(parts.config.env, method, heads=parts.config.heads, **schedule)
+    )
+    replay = make_replay(config, parts.task, parts.original_buffer)
     if method == "vcp":
         for _ in range(replay.capacity // SCORED):
-            update_her_buffer(replay, its.original_buffer, its.agent.q_variance, SCORED, rng)
+            update_her_buffer(replay, parts.original_buffer, parts.agent.q_variance, SCORED, rng)
     else:
-        replay.new_episodes(np.arange(its.original_buffer.size))
+        replay.new_episodes(np.arange(parts.original_buffer.size))
     batches = [replay.sample(config.batch_size, rng) for _ in range(BATCHES)]
     names = ("reward", "hindsight", "weight")
     return {name: np.concatenate([batch[name] for batch in batches]) for name in names}
@@ -66,20 +68,20 @@ def shares(batch: dict[str, np.ndarray]) -> dict[str, float]:
     kinds = {"originals": ~batch["hindsight"], "ahead": batch["reward"] < 0}
     weights = {"": np.ones_like(batch["weight"]), " weighted": batch["weight"]}
     return {
-        f"{kind}{how}": float(np.average(its, weights=w))
-        for kind, its in kinds.items()
+        f"{kind}{how}": float(np.average(chosen, weights=w))
+        for kind, chosen in kinds.items()
         for how, w in weights.items()
     }
 
 
-def replayed(its: Parts) -> list[str]:
+def replayed(parts: Parts) -> list[str]:
     """A cell for each of METHODS; VCP with the critic of one network has none."""
     rng, cells = np.random.default_rng(0), []
     for method in METHODS:
-        if method == "vcp" and its.config.heads == 1:
+        if method == "vcp" and parts.config.heads == 1:
             cells.append("")
             continue
-        x = {name: f"{share:.1%}" for name, share in shares(drawn(its, method, rng)).items()}
+        x = {name: f"{share:.1%}" for name, share in shares(drawn(parts, method, rng)).items()}
         if method == "vcp":
             x = {n: f"{x[n]} ({x[f'{n} weighted']})" for n in ("originals", "ahead")}
         cells.append(f"{x['originals']}; {x['ahead']}")
@@ -99,14 +101,14 @@ def dead_share(units: torch.Tensor) -> float:
     return (units.amax(dim=1) == 0).float().mean().item()
 
 
-def dead(its: Parts) -> list[str]:
+def dead(parts: Parts) -> list[str]:
     """A cell for each of actor's trunk, actors' heads, critic's trunk, critics' heads."""
-    episodes, rng = its.original_buffer.episodes, np.random.default_rng(0)
+    episodes, rng = parts.original_buffer.episodes, np.random.default_rng(0)
     e, t = (rng.integers(n, size=4096) for n in episodes["action"].shape[:2])
     rows = np.hstack([episodes["obs"][e, t], episodes["desired_goal"][e]])
-    state = its.agent.normalizer(torch.from_numpy(rows))
+    state = parts.agent.normalizer(torch.from_numpy(rows))
     state_action = torch.cat([state, torch.from_numpy(episodes["action"][e, t])], 1)
-    layers = hidden(its.agent.actor, state) + hidden(its.agent.critic, state_action)
+    layers = hidden(parts.agent.actor, state) + hidden(parts.agent.critic, state_action)
     return [f"{dead_share(units):.0%}" for units in layers]
 
 
@@ -131,9 +133,9 @@ def main(argv: list[str] | None = None) -> None:
         print(f"| run | epoch | {' | '.join(columns)} |")
         print("|---" * (2 + len(columns)) + "|")
         for folder in given.folders:
-            its, rows = restored(folder)
-            name = f"{its.config.env}, {settings.variant(its.config)}"
-            print(f"| {name} | {rows[-1]['epoch']} | {' | '.join(cells(its))} |")
+            parts, rows = restored(folder)
+            name = f"{parts.config.env}, {settings.variant(parts.config)}"
+            print(f"| {name} | {rows[-1]['epoch']} | {' | '.join(cells(parts))} |")
     except UsageError as error:
         parser.error(str(error))
 

@@ -96,11 +96,13 @@ def planned(file: Path, given: argparse.Namespace) -> list[Config]:
             arguments = shlex.split(line, comments=True)
             if not arguments:
                 continue
-            its, unknown = parser.parse_known_args(arguments)
-            if unknown or not its.env:
+            line_given, unknown = parser.parse_known_args(arguments)
+            if unknown or not line_given.env:
                 raise UsageError(f"unknown: {' '.join(unknown)}" if unknown else "no --env")
-            common = {**settings(its.set), "num_workers": given.cores}
-            runs += all_runs(its.env, its.variants, its.seeds, common, Path(given.out))
+            common = {**settings(line_given.set), "num_workers": given.cores}
+            runs += all_runs(
+                line_given.env, line_given.variants, line_given.seeds, common, Path(given.out)
+            )
         except (argparse.ArgumentError, ValueError) as error:
             raise UsageError(f"{file}, line {number}: {error}") from error
     return runs

@@ -153,10 +153,10 @@ def write_policy(path: Path, agent: EnsembleDDPG, head: int, about: dict) -> Non
     deviation (float32), and `about` as JSON. UsageError if it cannot be written."""
     tensors = [*agent.actor.trunk, *agent.actor.own[head]]
     arrays = {f"p{i}": p.detach().cpu().numpy() for i, p in enumerate(tensors)}
-    its = {name: getattr(agent.normalizer, name).cpu().numpy() for name in ("mean", "std")}
+    scale = {name: getattr(agent.normalizer, name).cpu().numpy() for name in ("mean", "std")}
     text = np.array(json.dumps(about))
     try:
-        write_whole(path, lambda file: np.savez_compressed(file, about=text, **arrays, **its))
+        write_whole(path, lambda file: np.savez_compressed(file, about=text, **arrays, **scale))
     except OSError as error:
         raise UsageError(f"cannot write {path}: {error.strerror or error}") from error
 
@@ -173,9 +173,9 @@ def read_policy(path: Path) -> tuple[EnsembleDDPG, dict]:
         sizes = [env.observation_space[name].shape[0] for name in ("observation", "desired_goal")]
         agent = EnsembleDDPG(*sizes, *env.action_space.shape, gamma=0.98, num_heads=1)
         env.close()
-        its = {f"p{i}": p for i, p in enumerate(agent.actor.parameters())}
-        its |= {name: getattr(agent.normalizer, name) for name in ("mean", "std")}
-        for name, p in its.items():
+        tensors = {f"p{i}": p for i, p in enumerate(agent.actor.parameters())}
+        tensors |= {name: getattr(agent.normalizer, name) for name in ("mean", "std")}
+        for name, p in tensors.items():
             p.copy_(torch.from_numpy(arrays[name]).reshape(p.shape))
     except UsageError:
         raise

@@ -176,14 +176,14 @@ def complete(config: Config) -> Config:
 
 def checked(f, value: Any) -> Any:
     """The value of a field of Config, in its type. UsageError for another type or range."""
-    what, its, limits = flag(f.name), kind(f), f.metadata["limits"]
-    if its is float and type(value) is int:
+    what, wanted, limits = flag(f.name), kind(f), f.metadata["limits"]
+    if wanted is float and type(value) is int:
         value = float(value)
-    if type(value) is not its:
-        raise UsageError(f"{what} must be of type {its.__name__}, not {value!r}")
+    if type(value) is not wanted:
+        raise UsageError(f"{what} must be of type {wanted.__name__}, not {value!r}")
     if f.metadata["choices"] and value not in f.metadata["choices"]:
         raise UsageError(f"{what} must be one of {', '.join(f.metadata['choices'])}, not {value!r}")
-    if its is float and not math.isfinite(value):
+    if wanted is float and not math.isfinite(value):
         raise UsageError(f"{what} must be a finite number, not {value}")
     for limit, refused, words in (
         ("least", operator.lt, "{} or more"),

@@ -182,8 +182,8 @@ def _played(env: Border) -> tuple[list[dict], bool]:
             break
     for seed in reversed(range(MOST_LOOKED_AT)):
         again, _ = env.reset(seed=seed)
-    for its in played:
-        env.compare(its)
+    for episode in played:
+        env.compare(episode)
     return rows, all(np.array_equal(first[key], again[key]) for key in first)
 
 
