@@ -133,20 +133,45 @@ def test_her_buffer_refuses_what_it_cannot_use():
     np.testing.assert_array_equal(buffer.data["variance"][:5], [0, 1, 2, 0, 1])
 
 
-@pytest.mark.parametrize("priority", ["consistency", "variance", "uniform"])
+@pytest.mark.parametrize("priority", ["consistency", "variance", "uniform", "within-kind"])
 def test_sampling_follows_the_priorities(priority):
     variance = np.array([0.0, 0.1, 0.2, 0.5, 0.9, 1.0])
     buffer = HERBuffer(6, temperature=3, priority=priority)
-    buffer.add(transitions(range(6)), variance)
+    buffer.add({**transitions(range(6)), "hindsight": np.arange(6) % 3 != 0}, variance)
     buffer.update_priorities()
-    x = {"consistency": 1 - variance, "variance": variance, "uniform": np.ones(6)}[priority] + 1e-6
+    x = {
+        "consistency": 1 - variance,
+        "variance": variance,
+        "uniform": np.ones(6),
+        "within-kind": np.array([0.5, 0.9, 0.8, 0, 0.1, 0]),  # of originals 0 and 3, and the others
+    }[priority] + 1e-6
     expected = x**3 / np.sum(x**3)
+    if priority == "within-kind":
+        originals, hindsight = x[[0, 3]] ** 3, x[[1, 2, 4, 5]] ** 3
+        expected[[0, 3]] = 2 / 6 * originals / originals.sum()
+        expected[[1, 2, 4, 5]] = 4 / 6 * hindsight / hindsight.sum()
     np.testing.assert_allclose(buffer.probabilities, expected, rtol=1e-12)
     drawn = buffer.sample(200_000, np.random.default_rng(0))["obs"][:, 0].astype(int)
     counts = np.bincount(drawn, minlength=6)
     rare = expected < 1e-9
     assert counts[rare].sum() == 0
     assert_frequencies(counts[~rare], expected[~rare] / expected[~rare].sum())
+
+
+@pytest.mark.parametrize("hindsight", [[True, False] * 3, [True] * 6, [False] * 6], ids=str)
+def test_weights_within_a_kind_count_no_kind_a_second_time(hindsight):
+    """Each kind has the weight of its draws; within it, w is p."""
+    kind, variance = np.array(hindsight), np.array([0.0, 5.0, 0.1, 9.0, 0.2, 7.0])
+    buffer = HERBuffer(6, temperature=2, priority="within-kind")
+    buffer.add({**transitions(range(6)), "hindsight": kind}, variance)
+    buffer.update_priorities()
+    batch = buffer.sample(400, np.random.default_rng(0))
+    p = buffer.probabilities[batch["obs"][:, 0].astype(int)]
+    for of_the_kind in (batch["hindsight"], ~batch["hindsight"]):
+        if of_the_kind.any():
+            expected = p[of_the_kind] / p[of_the_kind].mean()
+            np.testing.assert_allclose(batch["weight"][of_the_kind], expected, rtol=1e-6)
+    assert abs(buffer.probabilities[kind].sum() - kind.mean()) < 1e-12
 
 
 def test_sampling_is_right_for_every_random_number():
@@ -1037,6 +1062,7 @@ def test_each_seed_and_epoch_has_random_numbers_of_its_own(tmp_path, monkeypatch
     [
         {"priority": "uniform"},
         {"priority": "variance"},
+        {"priority": "within-kind"},
         {"importance": "none"},
         {"importance": "inverse"},
         {"acting_head": "one"},

@@ -38,10 +38,26 @@ def value_consistency_priority(
     return priority / priority.sum()  # p_i / Σ p
 
 
-PRIORITIES = {  # Section 5.6: the method and its two ablations
-    "consistency": value_consistency_priority,
-    "variance": lambda variance, temperature: value_consistency_priority(-variance, temperature),
-    "uniform": lambda variance, temperature: np.full(len(variance), 1 / len(variance)),
+def priority_within_kinds(
+    variance: np.ndarray, hindsight: np.ndarray, temperature: float
+) -> np.ndarray:
+    """Not in the paper: Eq. (4) among the hindsight of B_h, and again among its originals, each
+    kind by its own variances and drawn as often as it stands there. (N,), (N,) bool -> (N,).
+
+    Where the variance of originals is far above the rest, Eq. (4) over both kinds together leaves
+    them out and prefers nothing among the hindsight (NOTES.md, "Originals and hindsight in one B_h").
+    """
+    p = np.empty(len(variance))
+    for kind in filter(np.any, (hindsight, ~hindsight)):
+        p[kind] = kind.mean() * value_consistency_priority(variance[kind], temperature)
+    return p
+
+
+PRIORITIES = {  # of the rows that B_h holds: the method, Section 5.6's two ablations, and ours
+    "consistency": lambda rows, t: value_consistency_priority(rows["variance"], t),
+    "variance": lambda rows, t: value_consistency_priority(-rows["variance"], t),
+    "uniform": lambda rows, t: np.full(len(rows["variance"]), 1 / len(rows["variance"])),
+    "within-kind": lambda rows, t: priority_within_kinds(rows["variance"], rows["hindsight"], t),
 }
 
 IMPORTANCE = {  # the loss weight of a drawn transition; scaled to mean 1 in the mini-batch (ours)
@@ -65,6 +81,7 @@ class HERBuffer:
     ):
         self.capacity, self.temperature = capacity, temperature
         self._priority, self._importance = PRIORITIES[priority], IMPORTANCE[importance]
+        self.within_kind = priority == "within-kind"
         self.size = self._next = 0
         self.data: Batch = {}  # the batch's arrays with `capacity` rows, and "variance"
         self.probabilities = self._cumulative = np.empty(0)  # (size,)
@@ -92,7 +109,8 @@ class HERBuffer:
 
     def update_priorities(self) -> None:
         """Algorithm 1, line 7: Eq. (4) over all of B_h, from the stored variances. O(N)."""
-        self.probabilities = self._priority(self.data["variance"][: self.size], self.temperature)
+        rows = {name: x[: self.size] for name, x in self.data.items()}
+        self.probabilities = self._priority(rows, self.temperature)
         cumulative = self.probabilities.cumsum()
         self._cumulative = cumulative / cumulative[-1]
 
@@ -106,7 +124,10 @@ class HERBuffer:
         i = np.searchsorted(self._cumulative, rng.random(batch_size), side="right")
         batch = {name: x[i] for name, x in self.data.items()}
         weight = self._importance(self.probabilities[i])
-        batch["weight"] = (weight / weight.mean()).astype(np.float32)
+        hindsight = batch["hindsight"] if self.within_kind else np.zeros(batch_size, bool)
+        for kind in filter(np.any, (hindsight, ~hindsight)):  # all, or each kind by itself
+            weight[kind] /= weight[kind].mean()
+        batch["weight"] = weight.astype(np.float32)
         return batch
 
     def state_dict(self) -> dict:

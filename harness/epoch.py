@@ -25,6 +25,7 @@ class Epoch:
         self.successes: list[np.ndarray] = []  # of training episodes, (N,) a cycle
         self.losses: list[torch.Tensor] = []  # of critic and actor, (n, 2) an update of n heads
         self.originals: list[float] = []  # their share in each mini-batch
+        self.original_weights: list[float] = []  # their share in its loss, by weight
         self.tests: list[tuple[np.ndarray, np.ndarray]] = []  # success (N,) and Q (K, ...) a round
         # disable=None: no bar where the output is not a terminal
         self.bar = tqdm(desc=f"epoch {number}/{epochs}", total=rounds, leave=False, disable=None)
@@ -40,7 +41,10 @@ class Epoch:
     def note(self, losses: torch.Tensor, batches: list[Batch]) -> None:
         """An update of n heads: losses (n, 2) and the mini-batches."""
         self.losses.append(losses)
-        self.originals += [1 - batch["hindsight"].mean() for batch in batches]
+        for batch in batches:
+            original = 1 - batch["hindsight"]
+            self.originals.append(original.mean())
+            self.original_weights.append((original * batch["weight"]).mean())  # of mean 1
 
     def row(self, env_steps: int, agent: EnsembleDDPG, replay, wall_seconds: float) -> dict:
         """The row. replay: B_h or another method's. FloatingPointError for NaN or Inf in a loss."""
@@ -59,6 +63,7 @@ class Epoch:
             "actor_loss": actor_loss,
             **variance_by_kind(agent, replay),
             "batch_original_fraction": float(sum(self.originals) / len(self.originals)),
+            "loss_original_fraction": float(sum(self.original_weights) / len(self.originals)),
             "her_buffer_size": replay.size,
             **{f"{name}_seconds": value for name, value in self.seconds.items()},
         }

@@ -27,10 +27,26 @@ def priorities(variance: torch.Tensor, temperature: float, eps: float = 1e-6) ->
     return priority / priority.sum()
 
 
+def priorities_within_kinds(
+    variance: torch.Tensor, hindsight: torch.Tensor, temperature: float
+) -> torch.Tensor:
+    """`vcp.priority_within_kinds`, without asking the GPU which kinds there are."""
+    total = torch.zeros_like(variance)
+    for kind in (hindsight, ~hindsight):
+        most = variance.masked_fill(~kind, -torch.inf).max()
+        consistency = most - variance + 1e-6  # of its own kind; -Inf where there is none
+        consistency = torch.where(kind, consistency, 0)
+        ratio = (consistency / consistency.max()) ** temperature
+        share = torch.where(kind, ratio, 0)
+        total += torch.where(kind, kind.double().mean() * share / share.sum(), 0)
+    return total
+
+
 PRIORITIES = {
-    "consistency": priorities,
-    "variance": lambda variance, temperature: priorities(-variance, temperature),
-    "uniform": lambda variance, temperature: torch.full_like(variance, 1 / len(variance)),
+    "consistency": lambda rows, t: priorities(rows["variance"], t),
+    "variance": lambda rows, t: priorities(-rows["variance"], t),
+    "uniform": lambda rows, t: torch.full_like(rows["variance"], 1 / len(rows["variance"])),
+    "within-kind": lambda rows, t: priorities_within_kinds(rows["variance"], rows["hindsight"], t),
 }
 IMPORTANCE = {**vcp.IMPORTANCE, "none": torch.ones_like}
 
@@ -77,8 +93,9 @@ class HERBufferOnGPU(vcp.HERBuffer):
         self.probabilities, self._drawn = np.empty(0), []  # the older ones no longer hold
 
     def update_priorities(self) -> None:
-        variance = self.data["variance"][: self.size].double()
-        self.probabilities = self._priority(variance, self.temperature)
+        rows = {name: self.data[name][: self.size] for name in ("variance", "hindsight")}
+        rows["variance"] = rows["variance"].double()
+        self.probabilities = self._priority(rows, self.temperature)
         cumulative = self.probabilities.cumsum(0)
         self._cumulative = cumulative / cumulative[-1]
         self._drawn = []
@@ -91,9 +108,14 @@ class HERBufferOnGPU(vcp.HERBuffer):
             u = torch.as_tensor(rng.random((self.at_once, batch_size)), device=self.device)
             i = torch.searchsorted(self._cumulative, u, right=True)  # (at_once, B)
             batch = {name: x[i] for name, x in self.data.items()}
-            weight = self._importance(self.probabilities[i])
-            batch["weight"] = (weight / weight.mean(-1, keepdim=True)).float()
             batch["hindsight"] = batch["hindsight"].float()
+            weight = self._importance(self.probabilities[i])
+            kind = batch["hindsight"] if self.within_kind else torch.zeros_like(weight)
+            sums = [
+                (weight * k).sum(-1, keepdim=True) / k.sum(-1, keepdim=True)
+                for k in (kind, 1 - kind)
+            ]
+            batch["weight"] = (weight / torch.where(kind == 1, *sums)).float()
             self._drawn = [{n: x[j] for n, x in batch.items()} for j in range(self.at_once)]
         return self._drawn.pop(0)
 

@@ -40,11 +40,12 @@ COLUMNS = [
     "collect_seconds",
     "train_seconds",
     "eval_seconds",
+    "loss_original_fraction",
 ]
 TIMING_COLUMNS = {name for name in COLUMNS if name.endswith("_seconds")}
 PACKAGES = ("numpy", "torch", "gymnasium", "gymnasium-robotics", "mujoco")
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
-FORMAT = 4  # of checkpoints; others are refused
+FORMAT = 5  # of checkpoints; others are refused
 MAY_CHANGE = ("epochs", "out", "device", "num_workers", "tensorboard")  # when a run is resumed
 
 

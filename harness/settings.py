@@ -85,7 +85,10 @@ class Config:
         None, VCP, "transitions that B_h holds (default: as many as a cycle draws)", least=1
     )
     priority: str = setting(
-        "consistency", COMPARISON, "Eq. (4), or an ablation of Section 5.6", [*PRIORITIES]
+        "consistency",
+        COMPARISON,
+        "Eq. (4), an ablation of Section 5.6, or Eq. (4) within each kind (not in the paper)",
+        [*PRIORITIES],
     )
     acting_head: str = setting(
         "all", COMPARISON, "the heads that collect episodes, Section 5.6", ["all", "one"]

@@ -140,6 +140,10 @@ def test_the_columns_are_what_they_say(spied):
     np.testing.assert_allclose(row["test_q"], np.mean([q for *_, q in seen["values"]]), rtol=1e-5)
     originals = np.mean([1 - batch["hindsight"].mean() for batch in seen["batches"]])
     np.testing.assert_allclose(row["batch_original_fraction"], originals)
+    pairs = [(batch["weight"], ~batch["hindsight"]) for batch in seen["batches"]]
+    by_weight = np.mean([weight[kind].sum() / weight.sum() for weight, kind in pairs])
+    np.testing.assert_allclose(row["loss_original_fraction"], by_weight, rtol=1e-5)
+    assert abs(by_weight - originals) > 0.01
     assert row["epoch"] == 1 and row["env_steps"] == 16 * 20 * 4
     assert row["her_buffer_size"] == 333
     ((_, agent),), ((_, b_h),) = seen["agent"], seen["b_h"]
