@@ -45,7 +45,7 @@ def priority_within_kinds(
     kind by its own variances and drawn as often as it stands there. (N,), (N,) bool -> (N,).
 
     Where the variance of originals is far above the rest, Eq. (4) over both kinds together leaves
-    them out and prefers nothing among the hindsight (NOTES.md, "Originals and hindsight in one B_h").
+    them out and is flat among the hindsight (NOTES.md, "Originals and hindsight in one B_h").
     """
     p = np.empty(len(variance))
     for kind in filter(np.any, (hindsight, ~hindsight)):

@@ -5,6 +5,7 @@ with exit code 2, or with 1 once training has begun.
 """
 
 import os
+import random
 import re
 import resource
 import shutil
@@ -20,7 +21,7 @@ import pytest
 from ensemble import EnsembleDDPG
 from harness import assemble, records
 from harness.border import remark
-from harness.errors import UsageError
+from harness.errors import EnvironmentFailed, UsageError
 from harness.settings import Config, complete
 from harness.tasks import examine, make_env
 from harness.testing import HERE, SMALL, Line, finish, main, start, without_timing
@@ -71,8 +72,13 @@ def in_place(self, achieved_goal, desired_goal, info):
 
 def drawn_globally(self, *, seed=None, options=None):
     Line.reset(self, seed=seed)
-    self.x, self.g = np.random.uniform(-1, 1, (2, 1))  # noqa: NPY002
+    self.x, self.g = np.random.uniform(-1, 1, 1), np.array([random.uniform(-1, 1)])  # noqa: NPY002
     return self.observe(), {}
+
+
+def shrinks_without_seed(self, *, seed=None, options=None):
+    self.tolerance *= 1 if seed is not None else 0.3
+    return Line.reset(self, seed=seed)
 
 
 def changes_folder(self, render_mode=None):
@@ -227,6 +233,7 @@ REFUSED = {  # before anything is written
 }
 
 STOPPED = {  # once training has begun
+    odd("ShrinksLater", tolerance=3.0, reset=shrinks_without_seed): "compute_reward of what it",
     odd("ExitsLater", step=later(raising(SystemExit()))): "its step raised SystemExit",
     odd(
         "NaNLater", step=later(lambda s, o, *more: ({**o, "achieved_goal": s.x * np.nan}, *more))
@@ -321,6 +328,18 @@ def test_pictures_that_are_none_are_refused_before_anything_is_played(
     assert stop.value.code == 2 and out == "" and err.count("\n") == 1
     assert re.search(f"cannot draw {env} .*{message}", err), err
     assert not (tmp_path / "a.gif").exists() and os.environ["MUJOCO_GL"] == "as it was"
+
+
+def test_a_reward_that_is_not_given_again_shows_in_the_last_step_and_after_a_reset():
+    still = np.zeros(1, np.float32)
+    for when in ("step", "reset"):
+        env = make_env("Plain-v0")
+        env.reset(seed=0)
+        for _ in range(9 if when == "step" else 3):
+            assert env.step(still)[1] == -1
+        env.unwrapped.tolerance = 9
+        with pytest.raises(EnvironmentFailed, match=r"step 1 gave the reward -1, .* gives 0 \("):
+            env.step(still) if when == "step" else env.reset()
 
 
 def test_global_generators_follow_the_seed_in_each_process(tmp_path):
