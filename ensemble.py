@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 HIDDEN = 256  # Appendix B
+PART = 256  # rows that are scored in one call: what a cache holds, whatever the number of threads
 
 
 def linear(x: torch.Tensor, w: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -190,12 +191,19 @@ class EnsembleDDPG:
         return self._q_variance(self.critic, obs, action, goal)
 
     @torch.no_grad()
-    def snapshot_q_variance(self) -> Callable[..., np.ndarray]:
+    def snapshot_q_variance(self, map=map) -> Callable[..., np.ndarray]:
         """`q_variance` with the critics as they stand now: a copy of them, which another thread
-        can use while `update_heads` changes the originals. It holds until the next call."""
+        can use while `update_heads` changes the originals. It holds until the next call.
+        map: such as a thread pool's, for PART rows at a time."""
         here, copied = self.critic, self._critic_snapshot
         torch._foreach_copy_(copied.trunk + copied.stacks, here.trunk + here.stacks)
-        return partial(self._q_variance, copied)
+
+        def q_variance(obs, action, goal):
+            starts = range(PART, len(obs), PART)
+            parts = (np.split(x, starts) for x in (obs, action, goal))
+            return np.concatenate([*map(partial(self._q_variance, copied), *parts)])
+
+        return q_variance
 
     @torch.no_grad()
     def _q_variance(self, critic: MultiHeadMLP, obs, action, goal) -> np.ndarray:
@@ -212,16 +220,28 @@ class EnsembleDDPG:
         """
         return self.update_heads([k], [batch])[0]
 
-    def update_heads(self, heads: Sequence[int], batches: list[dict]) -> torch.Tensor:
+    def update_heads(self, heads: Sequence[int], batches: list[dict], map=map) -> torch.Tensor:
         """`update_head` of n heads, each with a mini-batch of its own, in one step: the trunks' is
-        by the sum of the heads' gradients (NOTES.md, "Heads in turn or at once"). Returns (n, 2).
+        by the sum of the heads' gradients (NOTES.md, "Heads in turn or at once").
+
+        map: such as a thread pool's. The heads' gradients do not depend on each other, and are
+        added up in the heads' order, so the bits are the same for any number of threads.
+        Returns (n, 2), the critic's and the actor's loss of each.
         """
         losses = []
-        for k, batch in zip(heads, batches, strict=True):
-            losses.append(self._losses(k, batch))
-            losses[-1].sum().backward()  # the two networks have no parameter in common
+        for k, (loss, gradients) in zip(heads, map(self._gradients, heads, batches), strict=True):
+            for p, gradient in zip(self._parameters(k), gradients, strict=True):
+                p.grad = gradient if p.grad is None else p.grad.add_(gradient)
+            losses.append(loss)
         self._step()
-        return torch.stack(losses).detach()
+        return torch.stack(losses)
+
+    def _parameters(self, k: int) -> list[torch.Tensor]:
+        return [p for net in (self.actor, self.critic) for p in (*net.trunk, *net.own[k])]
+
+    def _gradients(self, k: int, batch: dict[str, np.ndarray]) -> tuple[torch.Tensor, tuple]:
+        losses = self._losses(k, batch)  # the two networks have no parameter in common
+        return losses.detach(), torch.autograd.grad(losses.sum(), self._parameters(k))
 
     def _step(self) -> None:
         self.optimizer.step()

@@ -58,7 +58,13 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     # + VCP+: one head steps after the other, or all at once (NOTES.md, "Heads in turn or at once")
     turns = np.arange(config.heads).reshape(-1, config.heads_at_once).tolist()
     test_rounds, began = math.ceil(config.eval_episodes / num_envs), time.perf_counter()
-    with parts.envs() as envs, records.held(folder, resume), ThreadPoolExecutor(1) as thread:
+    with (
+        parts.envs() as envs,
+        records.held(folder, resume),
+        ThreadPoolExecutor(1) as thread,  # for Algorithm 1
+        ThreadPoolExecutor(parts.threads()) as pool,  # for its products, and for the heads'
+    ):
+        map_heads = pool.map if config.heads_at_once > 1 else map
         rows = records.begin(folder, asdict(config), parts.state(), resume)
         began -= rows[-1]["wall_seconds"] if rows else 0
         print(task.made)
@@ -95,12 +101,13 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                         )
                     for _ in range(config.updates):  # + VCP+: 5 or 40 sweeps of the heads a cycle
                         if vcp:  # 13: in another thread, Algorithm 1, its lines 3-5
-                            critics, count = agent.snapshot_q_variance(), scored_a_sweep(config)
+                            critics = agent.snapshot_q_variance(pool.map)
+                            count = scored_a_sweep(config)
                             scored = thread.submit(score, original_buffer, critics, count, her_rng)
                         for heads in turns:  # 14: for each head
                             # 15: a mini-batch of its own, from B_h
                             batches = [replay.sample(config.batch_size, draw_rng) for _ in heads]
-                            losses = agent.update_heads(heads, batches)  # 16: 𝔸
+                            losses = agent.update_heads(heads, batches, map_heads)  # 16: 𝔸
                             epoch.note(losses, batches)
                         if vcp:  # 17: both are done; Algorithm 1, its lines 6-7
                             her_buffer.add(*scored.result())

@@ -10,6 +10,7 @@ import math
 import re
 import threading
 import timeit
+from concurrent.futures import ThreadPoolExecutor
 from decimal import Decimal, localcontext
 from fractions import Fraction
 from types import SimpleNamespace
@@ -578,6 +579,32 @@ def test_updates_are_those_of_plain_ddpg(turns):
                 torch.testing.assert_close(p, q, rtol=1e-3, atol=3e-5)
 
 
+def backwards(function, *lists):
+    """A `map` whose last call is the first to be done."""
+    return reversed([function(*arguments) for arguments in reversed([*zip(*lists, strict=True)])])
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    """Weights and variances of 1, 2, 3 and 16 threads, and of one that goes backwards."""
+    pools = [ThreadPoolExecutor(n) for n in (1, 2, 3, 16)]
+    maps = [map, backwards, *(pool.map for pool in pools)]
+    rows = [random_batch(n=700)[name] for name in ("obs", "action", "goal")]
+    learned = []
+    for how in maps:
+        agent = random_agent()
+        for i in range(3):
+            batches = [random_batch(seed=100 * i + k) for k in range(16)]
+            losses = agent.update_heads(range(16), batches, how)
+        weights = [p.detach() for p in agent.actor.parameters() + agent.critic.parameters()]
+        variance = torch.from_numpy(agent.snapshot_q_variance(how)(*rows))
+        learned.append([losses, variance, *weights])
+    for others in learned[1:]:
+        assert all(map(torch.equal, learned[0], others))
+    np.testing.assert_allclose(learned[0][1], agent.q_variance(*rows), rtol=1e-3)
+    for pool in pools:
+        pool.shutdown()
+
+
 def test_update_of_a_head_moves_it_and_the_trunk_and_nothing_else():
     agent = random_agent(num_heads=4)
     nets = (agent.actor, agent.critic, agent.target_actor, agent.target_critic)
@@ -857,12 +884,12 @@ def test_train_does_what_algorithm_2_says(acting_head, collecting, together, tmp
             super().__init__(*args, **kwargs)
             agents.append(self)
 
-        def update_heads(self, heads, batches):
+        def update_heads(self, heads, batches, map):
             assert len(heads) == together
             for k, batch in zip(heads, batches, strict=True):
                 calls.append((k, batch["obs"].tobytes()))
                 assert len(batch["obs"]) == 16
-            losses = super().update_heads(heads, batches)
+            losses = super().update_heads(heads, batches, map)
             if 3 in heads:
                 heads_moved.set()
             return losses
@@ -875,10 +902,10 @@ def test_train_does_what_algorithm_2_says(acting_head, collecting, together, tmp
             goals.append(goal)
             return super().act(obs, goal, heads)
 
-        def snapshot_q_variance(self):
+        def snapshot_q_variance(self, map):
             calls.append("snapshot")
             snapshots.append(copy.deepcopy(self))
-            return super().snapshot_q_variance()
+            return super().snapshot_q_variance(map)
 
     def spy_on_the_first(her_buffer, original_buffer, q_variance, size, *args):
         calls.append(("first", size))

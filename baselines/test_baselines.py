@@ -514,10 +514,10 @@ def test_a_resumed_run_of_every_method_equals_an_uninterrupted_one(method, tmp_p
 def test_the_heads_get_mini_batches_of_their_own(tmp_path, monkeypatch):
     batches = []
 
-    def spy(self, heads, drawn):
+    def spy(self, heads, drawn, map):
         pairs = zip(heads, drawn, strict=True)
         batches.extend((k, batch["obs"].tobytes()) for k, batch in pairs)
-        return update(self, heads, drawn)
+        return update(self, heads, drawn, map)
 
     update = EnsembleDDPG.update_heads
     monkeypatch.setattr(EnsembleDDPG, "update_heads", spy)

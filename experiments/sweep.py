@@ -99,7 +99,11 @@ def planned(file: Path, given: argparse.Namespace) -> list[Config]:
             line_given, unknown = parser.parse_known_args(arguments)
             if unknown or not line_given.env:
                 raise UsageError(f"unknown: {' '.join(unknown)}" if unknown else "no --env")
-            common = {**settings(line_given.set), "num_workers": given.cores}
+            common = {
+                **settings(line_given.set),
+                "num_workers": given.cores,
+                "threads": given.cores,
+            }
             runs += all_runs(
                 line_given.env, line_given.variants, line_given.seeds, common, Path(given.out)
             )
@@ -253,7 +257,7 @@ def main(argv: Iterable[str] | None = None) -> None:
         if given.plan:
             runs = planned(Path(given.plan), given)
         else:
-            common = {**settings(given.set), "num_workers": given.cores}
+            common = {**settings(given.set), "num_workers": given.cores, "threads": given.cores}
             runs = all_runs(given.env, given.variants, given.seeds, common, Path(given.out))
         check_environments(runs)
         if given.task is not None:

@@ -18,7 +18,7 @@ from harness.errors import UsageError
 from harness.gpu import EnsembleOnGPU, HERBufferOnGPU
 from harness.settings import Config
 from harness.tasks import Task, examine, make_env
-from harness.workers import ParallelEnvs, whole_heads
+from harness.workers import ParallelEnvs, available_cores, whole_heads
 from her import EpisodeBuffer
 from vcp import HERBuffer
 
@@ -61,6 +61,12 @@ class Parts:
     def state(self) -> tuple:
         """What a checkpoint keeps."""
         return self.agent, self.original_buffer, self.replay
+
+    def threads(self) -> int:
+        """How many compute beside each other. Heads that take turns are trained in the main thread,
+        which leaves one core fewer for the rest."""
+        threads = self.config.threads or len(available_cores())
+        return threads if self.config.heads_at_once > 1 else max(threads - 1, 1)
 
     @contextmanager
     def envs(self) -> Iterator[ParallelEnvs]:

@@ -7,7 +7,8 @@ that they are made from, and are called in the same way; `assemble` takes them f
 """
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -144,6 +145,11 @@ class EnsembleOnGPU(EnsembleDDPG):
         super().load_state_dict(state)
         self._begin()
 
+    def snapshot_q_variance(self, map=map) -> Callable[..., np.ndarray]:
+        """As `EnsembleDDPG.snapshot_q_variance`, of all rows in one call."""
+        super().snapshot_q_variance()
+        return partial(self._q_variance, self._critic_snapshot)
+
     @torch.no_grad()
     def act(self, obs: np.ndarray, goal: np.ndarray, heads: slice = slice(None)) -> np.ndarray:
         with self._lock:  # several workers ask
@@ -157,7 +163,7 @@ class EnsembleOnGPU(EnsembleDDPG):
                 self._followed = now
         return self._player.act(obs, goal, heads)
 
-    def update_heads(self, heads: Sequence[int], batches: list[Batch]) -> torch.Tensor:
+    def update_heads(self, heads: Sequence[int], batches: list[Batch], map=map) -> torch.Tensor:
         self._steps += 1
         if [*heads] != [*range(self.num_heads)]:
             return super().update_heads(heads, batches)

@@ -46,7 +46,14 @@ TIMING_COLUMNS = {name for name in COLUMNS if name.endswith("_seconds")}
 PACKAGES = ("numpy", "torch", "gymnasium", "gymnasium-robotics", "mujoco")
 CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
 FORMAT = 5  # of checkpoints; others are refused
-MAY_CHANGE = ("epochs", "out", "device", "num_workers", "tensorboard")  # when a run is resumed
+MAY_CHANGE = (
+    "epochs",
+    "out",
+    "device",
+    "threads",
+    "num_workers",
+    "tensorboard",
+)  # when a run is resumed
 
 
 def to_type(option: str, folder: Path) -> str:

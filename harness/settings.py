@@ -99,6 +99,9 @@ class Config:
         "where the networks are; auto: a GPU if any, and if all heads step together",
         ["auto", "cpu", "cuda"],
     )
+    threads: int | None = setting(
+        None, MACHINE, "threads that train and score (default: one a core)", least=1
+    )
     num_workers: int | None = setting(
         None, MACHINE, "processes for the environments (default: one a core, 4 at most)", least=1
     )

@@ -109,6 +109,15 @@ def shared(self):
     return self.arrays
 
 
+def almost_there(self):
+    """Nearer to the goal than float32 can tell."""
+    return {**Line.observe(self), "achieved_goal": self.g + 1e-8}
+
+
+def to_a_billionth(self, achieved_goal, desired_goal, info):
+    return -1.0 * (np.abs(achieved_goal - desired_goal)[..., 0] > 1e-9)
+
+
 ends = (False, False)  # neither terminated nor truncated
 
 
@@ -340,6 +349,13 @@ def test_a_reward_that_is_not_given_again_shows_in_the_last_step_and_after_a_res
         env.unwrapped.tolerance = 9
         with pytest.raises(EnvironmentFailed, match=r"step 1 gave the reward -1, .* gives 0 \("):
             env.step(still) if when == "step" else env.reset()
+
+
+def test_the_environments_own_word_says_what_succeeded():
+    env = make_env(odd("SaysYes", step=saying(lambda r: True)))
+    env.reset(seed=0)
+    _, reward, *_, info = env.step(np.zeros(1, np.float32))
+    assert reward == -1 and info["is_success"] is True
 
 
 def test_global_generators_follow_the_seed_in_each_process(tmp_path):

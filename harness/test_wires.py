@@ -177,7 +177,17 @@ def test_the_other_methods_get_theirs(method, settings, expected):
 
 def test_every_setting_is_in_the_runs_name_or_may_change():
     named = variant(complete(Config(**SETTINGS)))
-    unnamed = {"env", "seed", "out", "epochs", "device", "num_workers", "tensorboard", "method"}
+    unnamed = {
+        "env",
+        "seed",
+        "out",
+        "epochs",
+        "device",
+        "threads",
+        "num_workers",
+        "tensorboard",
+        "method",
+    }
     for f in fields(Config):
         assert (f.name in named) == (f.name not in unnamed), f.name
 
