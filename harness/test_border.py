@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -379,6 +380,24 @@ def test_an_environment_that_ignores_its_seed_is_said_to():
     assert "seed" not in examine("Plain-v0").made + examine("DrawnGlobally-v0").made
 
 
+def test_the_papers_tasks_are_not_remarked_on(capfd):
+    for name in ("FetchPush-v1", "FetchPush-v4", "FetchSilce-v1"):
+        examine(name)
+    assert capfd.readouterr().err == ""
+
+
+def test_every_environment_of_a_run_is_closed(tmp_path):
+    opened, closed = [], []
+
+    def init(self, render_mode=None):
+        Line.__init__(self)
+        opened.append(self)
+
+    env = odd("Counted", __init__=init, close=lambda self: closed.append(self))
+    train(Config(**{**SMALL, "env": env}, epochs=1, out=str(tmp_path / "run")))
+    assert len(opened) == 17 and {*map(id, opened)} == {*map(id, closed)}
+
+
 def test_a_grown_observation_is_not_taken_for_a_damaged_checkpoint(tmp_path, capfd):
     env = odd("Changes")
     main(arguments(env, tmp_path / "run"))
@@ -455,6 +474,11 @@ def test_memory_is_what_the_process_may_have(monkeypatch):
     )
     assert abs(assemble.memory() - min(2**30, there)) < 2**26
     task = examine("Plain-v0")
+    needed = [
+        assemble.memory_needed(complete(Config()), replace(task, horizon=steps))
+        for steps in (10, 1010)
+    ]
+    assert needed[1] - needed[0] == 2 * 16 * 1000 * 4 * 3  # two collections by 16 environments
     with pytest.raises(UsageError, match=r"GB are needed .* lower --heads, --batch-size"):
         assemble.refuse_what_does_not_fit(complete(Config(buffer_size=10**9)), task)
 
