@@ -8,6 +8,7 @@ import sys
 from dataclasses import asdict
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -21,7 +22,7 @@ from harness.errors import UsageError
 from harness.records import COLUMNS, as_tensors, epochs_done, read_checkpoint
 from harness.settings import METHODS, Config
 from harness.tasks import PAPER_ENVS, examine
-from harness.testing import finish, start, wait_for_an_epoch, without_timing
+from harness.testing import Tracker, finish, start, wait_for_an_epoch, without_timing
 from her import EpisodeBuffer
 from run import train
 from vcp import value_consistency_priority
@@ -526,6 +527,17 @@ def test_a_run_that_another_process_begins_meanwhile_is_left_to_it(tmp_path, cap
 
 
 @pytest.mark.slow
+def test_environments_are_checked_with_the_settings_of_the_runs(tmp_path):
+    gym.register("Lengthless-v0", Tracker)
+    runs = [
+        sweep.all_runs(["Lengthless-v0"], [variant], [0], {}, tmp_path)
+        for variant in ("episode_length=7", "")
+    ]
+    sweep.check_environments(runs[0])
+    with pytest.raises(UsageError, match="no episode length"):
+        sweep.check_environments(runs[1])
+
+
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_plan_that_is_told_to_stop_loses_no_whole_epoch(name, tmp_path):
     plan, out = tmp_path / "plan.txt", tmp_path / "runs"

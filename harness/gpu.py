@@ -91,7 +91,7 @@ class HERBufferOnGPU(vcp.HERBuffer):
             self.data[name][slots] = x
         self._next = (self._next + new) % self.capacity
         self.size = min(self.size + new, self.capacity)
-        self.probabilities, self._drawn = np.empty(0), []  # the older ones no longer hold
+        self.probabilities = np.empty(0)  # the older ones no longer hold
 
     def update_priorities(self) -> None:
         rows = {name: self.data[name][: self.size] for name in ("variance", "hindsight")}
