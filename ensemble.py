@@ -226,8 +226,11 @@ class EnsembleDDPG:
 
         map: such as a thread pool's. The heads' gradients do not depend on each other, and are
         added up in the heads' order, so the bits are the same for any number of threads.
-        Returns (n, 2), the critic's and the actor's loss of each.
+        Returns (n, 2), the critic's and the actor's loss of each. ValueError for lists of other
+        lengths.
         """
+        if len(heads) != len(batches):
+            raise ValueError(f"{len(heads)} heads and {len(batches)} mini-batches")
         losses = []
         for k, (loss, gradients) in zip(heads, map(self._gradients, heads, batches), strict=True):
             for p, gradient in zip(self._parameters(k), gradients, strict=True):

@@ -54,16 +54,19 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     vcp = config.method == "vcp"  # the others have no B_h, and a replay of their own
     num_envs, horizon = parts.num_envs, task.horizon
     acting = config.heads if config.acting_head == "all" else 1  # Section 5.6
-    steps, noise_shape = num_envs * horizon, (horizon, num_envs, task.action_dim)
+    noise_shape = (horizon, num_envs, task.action_dim)
     # + VCP+: one head steps after the other, or all at once (NOTES.md, "Heads in turn or at once")
     turns = np.arange(config.heads).reshape(-1, config.heads_at_once).tolist()
-    test_rounds, began = math.ceil(config.eval_episodes / num_envs), time.perf_counter()
+    test_rounds = math.ceil(config.eval_episodes / num_envs)
+    began = time.perf_counter()
     with (
         parts.envs() as envs,
         records.held(folder, resume),
-        ThreadPoolExecutor(1) as thread,  # for Algorithm 1
-        ThreadPoolExecutor(parts.threads()) as pool,  # for its products, and for the heads'
+        ThreadPoolExecutor(1, initializer=numerics.begin_thread) as thread,  # for Algorithm 1
+        # for the products of Algorithm 1 and of the heads
+        ThreadPoolExecutor(parts.threads(), initializer=numerics.begin_thread) as pool,
     ):
+        # a single head would only queue behind what is scored
         map_heads = pool.map if config.heads_at_once > 1 else map
         rows = records.begin(folder, asdict(config), parts.state(), resume)
         began -= rows[-1]["wall_seconds"] if rows else 0
@@ -78,13 +81,12 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                 with epoch.timed("collect"):  # 3: data generation
                     at_random = config.random_actions if cycle else 1
                     noise = exploration(play_rng, noise_shape, config.noise, at_random)
-                    policy = acting_heads(agent, acting, num_envs, noise)  # each its environments
+                    policy = acting_heads(agent, acting, num_envs, noise)
                     episodes, success = rollout(envs, policy, horizon)  # 4-8, 10, 11
                     slots = original_buffer.add(episodes, play_rng)  # 9: into B_o
                     # + HER+: the normaliser sees what the networks will, relabelled goals too
-                    seen = relabel_future(
-                        episodes, steps, play_rng, config.relabel_ratio, task.reward_fn
-                    )
+                    steps, ratio = num_envs * horizon, config.relabel_ratio
+                    seen = relabel_future(episodes, steps, play_rng, ratio, task.reward_fn)
                     agent.normalizer.update(np.concatenate([seen["obs"], seen["goal"]], axis=1))
                     if not vcp:  # + another method's replay
                         replay.new_episodes(slots)
@@ -96,9 +98,8 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                     if vcp and her_buffer.size == 0:
                         # + so that there is something to draw: once, as much as B_o holds
                         first = min(original_buffer.size * horizon, her_buffer.capacity)
-                        update_her_buffer(
-                            her_buffer, original_buffer, agent.q_variance, first, her_rng
-                        )
+                        critics = agent.snapshot_q_variance(pool.map)
+                        update_her_buffer(her_buffer, original_buffer, critics, first, her_rng)
                     for _ in range(config.updates):  # + VCP+: 5 or 40 sweeps of the heads a cycle
                         if vcp:  # 13: in another thread, Algorithm 1, its lines 3-5
                             critics = agent.snapshot_q_variance(pool.map)
@@ -112,13 +113,13 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                         if vcp:  # 17: both are done; Algorithm 1, its lines 6-7
                             her_buffer.add(*scored.result())
                             her_buffer.update_priorities()
-                    agent.update_targets()  # + HER+: once a cycle
+                    agent.update_targets()  # + HER+: once a cycle; VCP+: for each head
 
             envs.reset(test_seed)  # + Section 5.1
             for _ in range(test_rounds):
                 with epoch.timed("eval"):
                     epoch.tests.append(evaluate(envs, agent, horizon))
-            env_steps = steps * (number * config.cycles + 1)
+            env_steps = num_envs * horizon * (number * config.cycles + 1)
             rows.append(epoch.row(env_steps, agent, replay, time.perf_counter() - began))
             records.save(folder, asdict(config), rows, parts.state())
             epoch.write(rows[-1])
@@ -154,7 +155,7 @@ def episodes_of(worker: Worker, policy: Policy, horizon: int) -> tuple[dict, np.
     steps, actions = [worker.reset()], []  # 5: goals and initial states
     goal = steps[0]["desired_goal"]
     for t in range(horizon):  # 6: T steps
-        action = np.float32(policy(t, worker.envs, steps[-1]["observation"], goal))  # 7: a_t
+        action = np.float32(policy(t, worker.which, steps[-1]["observation"], goal))  # 7: a_t
         if not np.isfinite(action).all():
             raise FloatingPointError("NaN or Inf in the actions, so in the networks")
         obs, success = worker.step(action)  # 8: s_{t+1}; Eq. (1) gives r_t when it is needed
@@ -169,17 +170,17 @@ def episodes_of(worker: Worker, policy: Policy, horizon: int) -> tuple[dict, np.
     return episodes, success
 
 
-def acting_heads(agent: EnsembleDDPG, acting: int, num_envs: int, noise=None) -> Policy:
-    """π_k(s_t, g) of the first `acting` heads, which share the environments evenly: μ_k and the
-    noise that `exploration` has drawn, or μ_k alone."""
+def acting_heads(agent: EnsembleDDPG, acting: int, num_envs: int, drawn=None) -> Policy:
+    """π_k(s_t, g) of the first `acting` heads, which share the environments evenly: μ_k and what
+    `exploration` has drawn, or μ_k alone."""
 
-    def policy(t: int, envs: slice, obs: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        k = slice(envs.start * acting // num_envs, math.ceil(envs.stop * acting / num_envs))
-        action = agent.act(by_head(obs, k.stop - k.start), by_head(goal, k.stop - k.start), k)
-        action = action.reshape(len(obs), -1)
-        if noise is None:
+    def policy(t: int, which: slice, obs: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        first, end = which.start * acting // num_envs, math.ceil(which.stop * acting / num_envs)
+        rows = by_head(obs, end - first), by_head(goal, end - first)
+        action = agent.act(*rows, slice(first, end)).reshape(len(obs), -1)
+        if drawn is None:
             return action
-        gaussian, uniform, instead = (x[t, envs] for x in noise)
+        gaussian, uniform, instead = (x[t, which] for x in drawn)
         return np.where(instead, uniform, np.clip(action + gaussian, -1, 1))
 
     return policy

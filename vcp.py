@@ -53,6 +53,14 @@ def priority_within_kinds(
     return p
 
 
+def mean_one_within_kinds(weight: np.ndarray, hindsight: np.ndarray) -> np.ndarray:
+    """The loss weights (B,) so that neither kind counts for more than its draws. (B,) bool."""
+    weight = weight.copy()
+    for kind in filter(np.any, (hindsight, ~hindsight)):
+        weight[kind] /= weight[kind].mean()
+    return weight
+
+
 PRIORITIES = {  # of the rows that B_h holds: the method, Section 5.6's two ablations, and ours
     "consistency": lambda rows, t: value_consistency_priority(rows["variance"], t),
     "variance": lambda rows, t: value_consistency_priority(-rows["variance"], t),
@@ -124,10 +132,9 @@ class HERBuffer:
         i = np.searchsorted(self._cumulative, rng.random(batch_size), side="right")
         batch = {name: x[i] for name, x in self.data.items()}
         weight = self._importance(self.probabilities[i])
-        hindsight = batch["hindsight"] if self.within_kind else np.zeros(batch_size, bool)
-        for kind in filter(np.any, (hindsight, ~hindsight)):  # all, or each kind by itself
-            weight[kind] /= weight[kind].mean()
-        batch["weight"] = weight.astype(np.float32)
+        if self.within_kind:
+            weight = mean_one_within_kinds(weight, batch["hindsight"])
+        batch["weight"] = (weight / weight.mean()).astype(np.float32)
         return batch
 
     def state_dict(self) -> dict:

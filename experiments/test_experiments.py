@@ -526,7 +526,6 @@ def test_a_run_that_another_process_begins_meanwhile_is_left_to_it(tmp_path, cap
     assert not (first / "error.txt").exists()
 
 
-@pytest.mark.slow
 def test_environments_are_checked_with_the_settings_of_the_runs(tmp_path):
     gym.register("Lengthless-v0", Tracker)
     runs = [
@@ -538,6 +537,7 @@ def test_environments_are_checked_with_the_settings_of_the_runs(tmp_path):
         sweep.check_environments(runs[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_plan_that_is_told_to_stop_loses_no_whole_epoch(name, tmp_path):
     plan, out = tmp_path / "plan.txt", tmp_path / "runs"

@@ -11,13 +11,13 @@ from pathlib import Path
 
 from baselines import cher, dtgsh, herebp
 from baselines.her import HERReplay
-from ensemble import HIDDEN, EnsembleDDPG
+from ensemble import HIDDEN, PART, EnsembleDDPG
 from harness import records, settings
 from harness.border import Border
 from harness.errors import UsageError
 from harness.gpu import EnsembleOnGPU, HERBufferOnGPU
 from harness.settings import Config
-from harness.tasks import Task, examine, make_env
+from harness.tasks import Task, before_training, examine, make_env
 from harness.workers import ParallelEnvs, available_cores, whole_heads
 from her import EpisodeBuffer
 from vcp import HERBuffer
@@ -73,11 +73,13 @@ class Parts:
         """The environments, in their processes. Afterwards the one of the task is closed too."""
         workers = whole_heads(self.config.num_workers, self.num_envs, self.config.heads)
         length = self.config.episode_length
-        with (
-            closing(self.task.env),
-            ParallelEnvs(self.config.env, self.num_envs, workers, episode_length=length) as envs,
-        ):
-            yield envs
+        with closing(self.task.env):
+            with before_training():
+                parallel = ParallelEnvs(
+                    self.config.env, self.num_envs, workers, episode_length=length
+                )
+            with parallel as envs:
+                yield envs
 
 
 def memory_needed(config: Config, task: Task) -> int:
@@ -86,8 +88,8 @@ def memory_needed(config: Config, task: Task) -> int:
     row = 4 * (2 * task.obs_dim + task.goal_dim + task.action_dim + 4)
     of_a_head = 4 * HIDDEN * (HIDDEN + 2 + task.action_dim)
     networks = 9 * config.heads * of_a_head  # two, with targets and moments, and a copy of one
-    scored = settings.scored_a_sweep(config) * config.heads
-    hidden = 8 * HIDDEN * max(config.batch_size, scored)
+    # of all heads, as if all threads were at the end of a pass at once
+    hidden = 16 * HIDDEN * config.heads * max(config.batch_size, PART)
     # B_o, and what is being collected, twice
     steps = config.buffer_size + 2 * number_of_envs(config) * task.horizon
     b_o = 4 * steps * (task.obs_dim + task.goal_dim + task.action_dim)
@@ -113,6 +115,7 @@ def refuse_what_does_not_fit(config: Config, task: Task) -> None:
         raise UsageError(f"--buffer-size must hold {num_envs} episodes of {task.horizon} steps")
 
 
+@before_training()
 def assemble(config: Config) -> Parts:
     """All parts of a run, untrained. config: complete. UsageError for an environment that cannot be
     learned in, and for sizes that the memory does not hold."""

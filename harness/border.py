@@ -18,6 +18,7 @@ from gymnasium.spaces import Box
 from harness.errors import EnvironmentFailed
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
+PEN = "ignore_z_target_rotation"  # what a Pen task has and the others of its kind have not
 
 
 def asked(name: str, method: str, function: Callable, *args, **kwargs) -> Any:
@@ -44,12 +45,12 @@ def remark(text: str) -> None:
 
 
 def picture(frame: Any) -> np.ndarray:
-    """What `render` gave, if it is a picture: (height, width, 3) uint8. ValueError if it is not."""
+    """A copy of what `render` gave, (height, width, 3) uint8. ValueError if it is no picture."""
     if not isinstance(frame, np.ndarray):
         raise ValueError(f"no picture (height, width, 3) of uint8 but {type(frame)}")
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size:
         raise ValueError(f"no picture (height, width, 3) of uint8 but {frame.shape} {frame.dtype}")
-    return frame
+    return frame.copy()
 
 
 class Border(gym.Wrapper):
@@ -72,9 +73,10 @@ class Border(gym.Wrapper):
         self.places = {key: slice(*ends[i : i + 2]) for i, key in enumerate(KEYS)}
         # The Pen tasks' compute_reward gives something else for a batch than for a pair, in
         # gymnasium-robotics as in the gym of the paper (NOTES.md, "The Pen tasks' reward").
-        self.is_pen = getattr(env.unwrapped, "ignore_z_target_rotation", False)
+        self.is_pen = bool(asked(name, "class", getattr, env.unwrapped, PEN, False))
+        # seconds of a step; 1 where the environment does not say
+        self.dt = asked(name, "dt", lambda: float(getattr(env.unwrapped, "dt", 1)))
         self.episode = ([], [], [])  # its goal, what was achieved in each step, the rewards
-        self.best = 0.0
         self.best = self._best_reward()
 
     def failed(self, problem: str) -> EnvironmentFailed:
@@ -87,7 +89,7 @@ class Border(gym.Wrapper):
         achieved = np.stack([obs["achieved_goal"]] * 3)
         desired = np.stack([obs["achieved_goal"], obs["desired_goal"], obs["desired_goal"]])
         try:
-            rewards = np.asarray(self._asked_for(achieved, desired))
+            rewards = self._asked_for(achieved, desired)
         except EnvironmentFailed as error:
             why = said(error.__cause__)
             problem = f"its compute_reward does not take a batch of goals and no info ({why})"
@@ -166,7 +168,7 @@ class Border(gym.Wrapper):
 
     def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info=None) -> np.ndarray:
         """Eq. (1) of many pairs of goals, (B, G) and (B, G) -> (B,) of -1 and 0."""
-        rewards = np.asarray(self._asked_for(achieved, desired)) - self.best
+        rewards = self._asked_for(achieved, desired) - self.best
         if rewards.shape != achieved.shape[:-1]:
             problem = f"its compute_reward of {achieved.shape} goals gave {rewards.shape} rewards"
             raise self.failed(problem)
@@ -176,9 +178,12 @@ class Border(gym.Wrapper):
         return rewards
 
     def _asked_for(self, achieved, desired):
-        compute_reward = self.env.get_wrapper_attr("compute_reward")
-        goals = np.array(achieved), np.array(desired)  # which it may change
-        return asked(self.name, "compute_reward", compute_reward, *goals, {})
+        def ask():
+            compute_reward = self.env.get_wrapper_attr("compute_reward")
+            goals = np.array(achieved), np.array(desired)  # which it may change
+            return np.asarray(compute_reward(*goals, {}), dtype=float)
+
+        return asked(self.name, "compute_reward", ask)
 
     def compare(self, episode: tuple, dtype=None) -> None:
         """Compute the rewards of an `episode` again, from its goals as they were or as `dtype`.
@@ -223,6 +228,7 @@ def refuse_spaces(env: gym.Env, name: str) -> None:
     goals = isinstance(space, gym.spaces.Dict) and set(KEYS) <= set(space.keys())
     refuse(f"it has no goals (its observation is not a dict of {keys})", not goals)
     flat = all(isinstance(space[k], Box) and len(space[k].shape) == 1 for k in KEYS)
+    flat = flat and min(space[k].shape[0] for k in KEYS) > 0
     refuse(f"its {keys} are not all flat Boxes", not flat)
     same = space["achieved_goal"].shape == space["desired_goal"].shape
     refuse("its achieved_goal and desired_goal differ in size", not same)

@@ -42,8 +42,8 @@ def main(train: Callable, argv: list[str] | None = None) -> None:
             train(config, resume=command.resume is not None)
         except STOPS as error:  # no fault of run.py's
             stopped(folder, error)
-        except RuntimeError as error:  # PyTorch's MemoryError
-            if "can't allocate memory" not in str(error):
+        except RuntimeError as error:  # PyTorch's MemoryErrors
+            if "memory" not in str(error):
                 raise
             stopped(folder, MemoryError("the memory is full"))
         print(

@@ -34,7 +34,11 @@ class Epoch:
     def timed(self, name: str) -> Iterator[None]:
         """Add the wall time of the block to `seconds`, and a step to the bar."""
         start = time.perf_counter()
-        yield
+        try:
+            yield
+        except BaseException:
+            self.bar.close()  # what is said of it gets a line of its own
+            raise
         self.seconds[name] += time.perf_counter() - start
         self.bar.update()
 

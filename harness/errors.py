@@ -11,5 +11,4 @@ class FolderInUse(UsageError):
 
 
 class EnvironmentFailed(RuntimeError):
-    """An environment did in the course of a run what it must not do: it raised an error, or ended
-    an episode early."""
+    """An environment did what it must not do (see border.Border)."""

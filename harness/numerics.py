@@ -27,6 +27,13 @@ def one_thread():
         torch.set_num_threads(threads)
 
 
+def begin_thread() -> None:
+    """What a thread of the program's own begins with: the settings of `for_training` that PyTorch
+    keeps for each thread."""
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+
+
 def products_are_rounded() -> bool:
     """Whether a product of float32 matrices, in any of the four calls that training makes, loses
     digits that float32 has and bfloat16 has not."""

@@ -83,9 +83,11 @@ def try_to_draw(about: dict) -> None:
 def drawing(about: dict, mode: str) -> Iterator[Border]:
     """The environment, to be drawn in the block. UsageError where that fails: MuJoCo's renderers
     raise many kinds of errors without a display or a driver."""
-    warnings.simplefilter("ignore", UserWarning)  # gymnasium's, of a mode that is not there
     try:
-        with closing(make_env(about["env"], about["episode_length"], render_mode=mode)) as env:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # gymnasium's, of a mode that is not there
+            env = make_env(about["env"], about["episode_length"], render_mode=mode)
+        with closing(env):
             yield env
     except (EnvironmentFailed, UsageError) as error:
         hint = "without a display, set MUJOCO_GL=egl (a GPU's driver) or osmesa (libosmesa6)"

@@ -59,7 +59,8 @@ MAY_CHANGE = (
 def to_type(option: str, folder: Path) -> str:
     """A command that goes on with a run or plays it, from any folder."""
     program = Path(__file__).parent.parent / "run.py"
-    return shlex.join(["python", str(program), option, str(folder)])
+    words = ["python", str(program), option, str(folder)]
+    return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
 
 
 def write_whole(path: Path, write) -> None:

@@ -232,7 +232,8 @@ def load(folder: Path) -> Config:
     """The settings of the run in `folder`. UsageError if it holds none, or another version's."""
     try:
         saved = records.read_config(folder)
-        saved.pop("faithful", None)  # an option of earlier runs, off in all that are kept
+        if saved.get("faithful") is False:  # an option of earlier runs
+            del saved["faithful"]
         return Config(**saved)
     except (TypeError, AttributeError) as error:
         raise UsageError(f"{folder} holds a run of another version ({error})") from error

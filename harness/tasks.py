@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 
 import gymnasium as gym
@@ -91,7 +92,7 @@ def make_env(
     name = MISSPELT.get(name, name)
     length = episode_length or (PAPER_LENGTH if name in PAPER_ENVS else None)
     made = PAPER_ENVS.get(name, name)
-    if spec is not None:
+    if spec is not None and ":" not in made:
         gym.registry.setdefault(spec.id, spec)
     how = {"max_episode_steps": length, "disable_env_checker": True, **kwargs}
     try:
@@ -100,18 +101,24 @@ def make_env(
         raise UsageError(f"cannot make the environment {name}: {_why(name, error)}") from error
     with before_training():
         asked(name, "spaces", refuse_spaces, env, name)
-        if not (np.all(env.action_space.low == -1) and np.all(env.action_space.high == 1)):
+        box = env.action_space
+        if not (np.all(box.low == -1) and np.all(box.high == 1)):
+            # clipped, as rescaling rounds, and some environments look closely
+            clip = partial(np.clip, a_min=box.low, a_max=box.high)
+            env = gym.wrappers.TransformAction(env, clip, box)
             env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
         return Border(env, name)
 
 
 @contextmanager
 def before_training() -> Iterator[None]:
-    """What an environment does wrong in the block is bad input."""
+    """What an environment does wrong in the block is bad input; so is what does not fit."""
     try:
         yield
     except EnvironmentFailed as error:
         raise UsageError(f"cannot learn in the environment {error}") from error
+    except (MemoryError, OSError) as error:
+        raise UsageError(f"the run cannot be set up: {said(error)}") from error
 
 
 def _why(name: str, error: EnvironmentFailed) -> str:
@@ -147,7 +154,7 @@ def examine(
         obs_dim=space["observation"].shape[0],
         goal_dim=space["desired_goal"].shape[0],
         action_dim=env.action_space.shape[0],
-        dt=getattr(env.unwrapped, "dt", 1.0),
+        dt=env.dt,
         reward_fn=env.compute_reward,
         env=env,
     )
@@ -163,16 +170,18 @@ def examine(
 
 def _played(env: Border) -> tuple[list[dict], bool]:
     """Play the episodes, and compare their rewards with those that replay makes, at once and some
-    resets later. Returns their observations, MOST_ROWS at most, and whether two resets with one
-    seed are the same."""
+    resets later. Returns their observations, MOST_ROWS at most, and whether the first episode is
+    the same when it is played again with its seed."""
     rng, rows, played, reached = np.random.default_rng(0), [], [], False
     for episode in range(MOST_LOOKED_AT):
         obs, _ = env.reset(seed=episode)
         if episode == 0:
-            first = obs
+            first = [(None, obs)]
         for _ in range(env.horizon):
-            action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+            action = rng.uniform(-1.2, 1.2, env.action_space.shape).clip(-1, 1).astype(np.float32)
             obs, reward, *_ = env.step(action)
+            if episode == 0:
+                first.append((action, obs))
             reached = reached or reward == 0
             if len(rows) < MOST_ROWS:
                 rows.append(obs)
@@ -181,10 +190,12 @@ def _played(env: Border) -> tuple[list[dict], bool]:
         if reached:
             break
     for seed in reversed(range(MOST_LOOKED_AT)):
-        again, _ = env.reset(seed=seed)
+        obs, _ = env.reset(seed=seed)
     for episode in played:
         env.compare(episode)
-    return rows, all(np.array_equal(first[key], again[key]) for key in first)
+    again = [obs, *(env.step(action)[0] for action, _ in first[1:])]  # the first episode
+    pairs = zip((obs for _, obs in first), again, strict=True)
+    return rows, all(np.array_equal(a[key], b[key]) for a, b in pairs for key in a)
 
 
 def _look_at_the_scale(task: Task, rows: list[dict]) -> None:
@@ -198,7 +209,7 @@ def _look_at_the_scale(task: Task, rows: list[dict]) -> None:
     if 0 < spread.max() < FLOOR:
         where = f"differ by {spread.max():.1g} at most"
         raise task.env.failed(f"its goals {where}, which the networks hardly see: use other units")
-    if task.env.unwrapped.spec.id in PAPER_ENVS.values():
+    if task.env.spec.id in PAPER_ENVS.values():
         return
     obs = np.array([row["observation"] for row in rows], dtype=np.float64)
     moves = np.ptp(obs, axis=0) > 0

@@ -110,6 +110,13 @@ def shared(self):
     return self.arrays
 
 
+def without_a_goal(self, render_mode=None):
+    Line.__init__(self)
+    none = gym.spaces.Box(-1, 1, (0,), np.float64)
+    spaces = {**self.observation_space, "achieved_goal": none, "desired_goal": none}
+    self.observation_space = gym.spaces.Dict(spaces)
+
+
 def almost_there(self):
     """Nearer to the goal than float32 can tell."""
     return {**Line.observe(self), "achieved_goal": self.g + 1e-8}
@@ -174,7 +181,7 @@ REFUSED = {  # before anything is written
         ),
     ): "gives -1",
     odd(
-        "ReadsTheStep", compute_reward=computing(lambda s, r: r if s.t % 2 == 0 else 0 * r - 1)
+        "ReadsTheStep", compute_reward=computing(lambda s, r: 0 * r if s.t == 5 else r)
     ): "compute_reward of what it observed",
     odd(
         "WholeActions", action_space=gym.spaces.Box(0, 10, (1,), np.int64)
@@ -224,6 +231,19 @@ REFUSED = {  # before anything is written
     odd(
         "RewardsTwice", compute_reward=computing(lambda s, r: np.stack([r, r], -1).squeeze())
     ): "is not vectorised",
+    odd("RewardsNone", compute_reward=lambda s, a, d, i: [None] * len(a)): "but nan for a goal",
+    odd(
+        "RewardsText", compute_reward=lambda s, a, d, i: ["near"] * len(a)
+    ): r"no info \(ValueError",
+    odd("RewardsRagged", compute_reward=lambda s, a, d, i: [[0], [], 0]): r"no info \(ValueError",
+    odd("NoGoal", __init__=without_a_goal): "are not all flat Boxes",
+    odd("TimeRaises", dt=property(raising(RuntimeError("no clock")))): "its dt raised RuntimeError",
+    odd("GivesThree", compute_reward=computing(lambda s, r: r[:3] if np.ndim(r) else r)): (
+        r"its compute_reward of \(10, 1\) goals gave \(3,\) rewards"
+    ),
+    odd("TooFine", observe=almost_there, compute_reward=to_a_billionth): (
+        "step 1 gave the reward -1, and compute_reward of what it observed gives 0"
+    ),
     odd(
         "ForgetsTheAxis",
         compute_reward=lambda s, a, d, i: -1.0 * (np.linalg.norm(a - d) > s.tolerance),
@@ -359,6 +379,45 @@ def test_the_environments_own_word_says_what_succeeded():
     assert reward == -1 and info["is_success"] is True
 
 
+def test_pictures_are_copies():
+    canvas = np.zeros((9, 9, 3), np.uint8)
+    env = make_env(odd("DrawsInPlace", render=lambda self: canvas), render_mode="rgb_array")
+    first = env.render()
+    canvas[:] = 255
+    assert not first.any() and env.render().all()
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.7, 0.3), (0.1, 0.7), (-1e-3, 3e7)])
+def test_no_action_leaves_the_bounds_by_rounding(low, high):
+    box = gym.spaces.Box(low, high, (1,), np.float64)
+
+    def step(self, action):
+        assert box.contains(np.float64(action)), action
+        return Line.step(self, 0 * action)
+
+    env = make_env(odd(f"Bounds{low}".replace(".", ""), action_space=box, step=step))
+    env.reset(seed=0)
+    for action in (-1, 1, 0.3):
+        env.step(np.float32([action]))
+
+
+def test_what_cannot_be_made_in_a_worker_is_said_before_anything_is_written(tmp_path, capfd):
+    """As where a port or a licence is taken."""
+    main_process = os.getpid()
+
+    def init(self, render_mode=None):
+        Line.__init__(self)
+        if os.getpid() != main_process:
+            raise OSError("the port is taken")
+
+    env = odd("OneOfAKind", __init__=init)
+    with pytest.raises(SystemExit) as stop:
+        main(arguments(env, tmp_path / "run", workers=2))
+    err = capfd.readouterr().err
+    assert stop.value.code == 2 and "could not be started" in err and "Traceback" not in err
+    assert "the port is taken" in err and not (tmp_path / "run").exists()
+
+
 def test_global_generators_follow_the_seed_in_each_process(tmp_path):
     """Two workers draw other goals, the same in each run; in tests too."""
     for name in ("a", "b"):
@@ -375,8 +434,14 @@ def test_an_environment_that_ignores_its_seed_is_said_to():
         self.x = np.random.default_rng().uniform(-1, 1, 1)
         return self.observe(), info
 
-    made = examine(odd("IgnoresItsSeed", reset=reset_as(fresh))).made
-    assert "it does not follow its seed" in made
+    def trembling(self, obs, *more):
+        return {**obs, "observation": obs["observation"] + np.random.default_rng().normal()}, *more
+
+    for env in (
+        odd("IgnoresItsSeed", reset=reset_as(fresh)),
+        odd("Trembles", step=stepped(trembling)),
+    ):
+        assert "it does not follow its seed" in examine(env).made
     assert "seed" not in examine("Plain-v0").made + examine("DrawnGlobally-v0").made
 
 

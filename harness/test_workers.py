@@ -51,7 +51,7 @@ def test_workers_hold_whole_heads_or_a_part_of_one():
             "PointMassEmptyEnv-v1", num_envs, whole_heads(asked, num_envs, heads)
         ) as envs:
             assert envs.num_workers == made
-            rows = [np.arange(num_envs)[worker.envs] for worker in envs.workers]
+            rows = [np.arange(num_envs)[worker.which] for worker in envs.workers]
             np.testing.assert_array_equal(np.concatenate(rows), np.arange(num_envs))
 
 

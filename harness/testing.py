@@ -151,14 +151,15 @@ class Broken(envs_point.PointMass):
 
 
 class BrokenReward(envs_point.PointMass):
-    """Gives a NaN for goals far to the right."""
+    """Gives a NaN for goals far to the right, but not in an episode with a seed of its own."""
 
     def compute_reward(self, achieved_goal, desired_goal, info):
         reward = super().compute_reward(achieved_goal, desired_goal, info)
-        return np.where(np.asarray(achieved_goal)[..., 0] > 0.54, np.nan, reward)
+        return np.where(self.late & (np.asarray(achieved_goal)[..., 0] > 0.54), np.nan, reward)
 
-    def reset(self, **kwargs):
-        super().reset(**kwargs)
+    def reset(self, *, seed=None, options=None):
+        self.late = seed is None
+        super().reset(seed=seed)
         self._xy = self._goal = (0.3, 0.0)
         return self._observe(), {}
 

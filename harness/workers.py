@@ -6,6 +6,7 @@ environments on two cores that is a third of the time. So a worker holds a group
 
 import os
 import signal
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -15,7 +16,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
+from harness import numerics
 from harness.border import KEYS, Border
+from harness.errors import UsageError
 from harness.tasks import PAPER_ENVS, make_env
 
 MakeEnv = Callable[[], Border]
@@ -66,7 +69,13 @@ class EnvGroup(gym.Env):
                 signal.signal(signal.SIGHUP, signal.SIG_IGN)
             if core is not None:
                 os.sched_setaffinity(0, {core})
-        self.envs = [read_joints_by_index(make()) for _ in range(1 if for_its_spaces else size)]
+        try:
+            self.envs = [read_joints_by_index(make()) for _ in range(1 if for_its_spaces else size)]
+        except UsageError as error:  # only this one cannot be made: a port, a licence
+            if not main or for_its_spaces:
+                raise
+            print(f"run.py: {error}", file=sys.stderr, flush=True)
+            os._exit(2)
         spaces = self.envs[0].observation_space
         self.observation_space = gym.spaces.Dict(
             {k: gym.spaces.Box(-np.inf, np.inf, (size, *spaces[k].shape), np.float32) for k in KEYS}
@@ -93,18 +102,21 @@ class EnvGroup(gym.Env):
 
 
 class Worker:
-    """The environments `envs` of all, in a process of their own, or in this one without `main`."""
+    """The environments `which` of all, in a process of their own, or in this one without `main`."""
 
-    def __init__(self, name: str, make: MakeEnv, envs: slice, main: int | None, core: int | None):
-        self.name, self.envs = name, envs
-        group = partial(EnvGroup, make, envs.stop - envs.start, main, core)
+    def __init__(self, name: str, make: MakeEnv, which: slice, main: int | None, core: int | None):
+        self.name, self.which = name, which
+        group = partial(EnvGroup, make, which.stop - which.start, main, core)
         vector = AsyncVectorEnv if main else SyncVectorEnv
-        self._env = vector([group], copy=False, autoreset_mode=AutoresetMode.DISABLED)
+        try:
+            self._env = vector([group], copy=False, autoreset_mode=AutoresetMode.DISABLED)
+        except (EOFError, ConnectionError) as error:
+            raise UsageError(f"a worker process of {name} could not be started") from error
 
     def reset(self, seed: int | None = None) -> dict[str, np.ndarray]:
         """Start an episode in each. With a seed, environment i of all is seeded with seed + i;
         without, it goes on with the random numbers it has. Returns float32 arrays of (n, ...)."""
-        seed = None if seed is None else [seed + self.envs.start]
+        seed = None if seed is None else [seed + self.which.start]
         return self._copies(self._ask(self._env.reset, seed=seed)[0])
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
@@ -179,7 +191,7 @@ class ParallelEnvs:
         none waits for another: while one acts, the other steps. Returns the results in order."""
         if self.num_workers == 1:
             return [function(self.workers[0])]
-        pool = ThreadPoolExecutor(self.num_workers)
+        pool = ThreadPoolExecutor(self.num_workers, initializer=numerics.begin_thread)
         try:
             return list(pool.map(function, self.workers))
         finally:
