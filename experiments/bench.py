@@ -21,7 +21,7 @@ import torch
 import run
 from ensemble import HIDDEN, EnsembleDDPG
 from harness.assemble import make_replay
-from harness.numerics import fast_products, one_thread
+from harness.numerics import begin_thread, fast_products, one_thread
 from harness.settings import METHODS, Config, complete
 from harness.tasks import examine, make_env
 from harness.workers import ParallelEnvs, available_cores, whole_heads
@@ -205,20 +205,24 @@ def bench_algorithm_1(repeats: int, heads: int = 16) -> None:
             update_her_buffer(her_buffer, original, agent.q_variance, *how)
 
         def train(agent=agent, her_buffer=her_buffer, rng=rng):
-            for k in range(heads):
-                agent.update_head(k, her_buffer.sample(256, rng))
+            batches = [her_buffer.sample(256, rng) for _ in range(heads)]
+            agent.update_heads(range(heads), batches, pool.map)
 
         def beside(agent=agent, original=original, her_buffer=her_buffer, how=how, train=train):
-            scoring = thread.submit(score, original, agent.snapshot_q_variance(), *how)
+            scoring = thread.submit(score, original, agent.snapshot_q_variance(pool.map), *how)
             train()
             her_buffer.add(*scoring.result())
             her_buffer.update_priorities()
 
         def in_turn_with_it(agent=agent, buffers=(her_buffer, original), how=how, train=train):
-            update_her_buffer(*buffers, agent.q_variance, *how)
+            update_her_buffer(*buffers, agent.snapshot_q_variance(pool.map), *how)
             train()
 
-        with ThreadPoolExecutor(1) as thread, fast_products():
+        with (
+            ThreadPoolExecutor(1, initializer=begin_thread) as thread,
+            ThreadPoolExecutor(len(available_cores()), initializer=begin_thread) as pool,
+            fast_products(),
+        ):
             ways = dict(zip(names, (train, beside, in_turn_with_it), strict=True))
             t = in_turn(ways, repeats)
             with busy_core():
