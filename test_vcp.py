@@ -603,6 +603,8 @@ def test_any_number_of_threads_gives_the_same_bits():
     np.testing.assert_allclose(learned[0][1], agent.q_variance(*rows), rtol=1e-3)
     for pool in pools:
         pool.shutdown()
+    with pytest.raises(ValueError, match="2 heads and 1 mini-batches"):
+        agent.update_heads([0, 1], batches[:1])
 
 
 def test_update_of_a_head_moves_it_and_the_trunk_and_nothing_else():

@@ -25,6 +25,15 @@ def test_a_run_is_loaded_to_act(tmp_path):
         load(tmp_path)
 
 
+def test_a_thread_a_core_or_as_many_as_are_asked_for(monkeypatch):
+    """Where heads take turns the main thread is one of them."""
+    monkeypatch.setattr("harness.assemble.available_cores", lambda: [0, 1, 2, 3])
+    for threads, at_once, made in ((None, 4, 4), (None, 1, 3), (3, 2, 3), (3, 1, 2), (1, 1, 1)):
+        given = {"heads": 4, "heads_at_once": at_once, "threads": threads}
+        parts = assemble(complete(Config(env="PointMassEmptyEnv-v1", **given)))
+        assert parts.threads() == made
+
+
 def test_a_buffer_too_small_for_what_is_collected_is_refused():
     for size, message in ((49, "50 or more"), (799, "hold 16 episodes of 50 steps")):
         with pytest.raises(UsageError, match=message):

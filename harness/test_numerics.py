@@ -2,11 +2,12 @@
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 
-from harness.numerics import fast_products, one_thread, small_calls
+from harness.numerics import begin_thread, fast_products, one_thread, small_calls
 from harness.testing import HERE, SMALL_TRAINING
 
 
@@ -36,6 +37,18 @@ def test_fast_products_are_float32_or_left_alone(call, monkeypatch):
     monkeypatch.setattr(torch, call, rounded)  # a processor that rounds
     with fast_products():
         assert setting.fp32_precision == before
+
+
+def test_a_thread_begins_with_the_settings_of_training():
+    def settings():
+        zeros = torch.full((1,), 1e-20).square() == 0
+        return torch.get_num_threads(), zeros.item()
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    with ThreadPoolExecutor(1, initializer=begin_thread) as pool:
+        assert pool.submit(settings).result() == (1, True)
+    torch.set_num_threads(before)
 
 
 def test_training_takes_denormals_for_zero_in_all_threads(tmp_path):
