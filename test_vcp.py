@@ -1076,6 +1076,7 @@ def test_each_seed_and_epoch_has_random_numbers_of_its_own(tmp_path, monkeypatch
     spy(ParallelEnvs, "reset", lambda envs, seed: resets.append(seed))
     spy(run, "exploration", stream("exploration", 0))
     spy(run, "score", stream("score", 3))
+    spy(run, "update_her_buffer", stream("score", 4))
     spy(HERBuffer, "sample", stream("sample", 2))
     settings = {**SMALL_TRAINING, "env": "PointMassEmptyEnv-v1", "epochs": 2, "num_workers": 1}
     for seed in (0, 1):

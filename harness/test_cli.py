@@ -260,15 +260,15 @@ def test_other_signals_end_a_run_as_ctrl_c_does(name, workers, tmp_path):
     assert gone(its)
 
 
-HANGS = """
-import sys, time, gymnasium, run
+HANGS = r"""
+import os, sys, time, gymnasium, run
 from envs_point import PointMass
 class Hangs(PointMass):
     steps = 0
     def step(self, action):
         self.steps += 1
         if self.steps > 900:
-            print("hangs", flush=True)
+            os.write(1, b"hangs\n")  # whole, where two workers write at once
             time.sleep(600)
         return super().step(action)
 gymnasium.register("Hangs-v0", Hangs, max_episode_steps=50)
