@@ -55,7 +55,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     num_envs, horizon = parts.num_envs, task.horizon
     acting = config.heads if config.acting_head == "all" else 1  # Section 5.6
     noise_shape = (horizon, num_envs, task.action_dim)
-    # + VCP+: one head steps after the other, or all at once (NOTES.md, "Heads in turn or at once")
+    # + ours: with many updates the heads step together (NOTES.md, "Heads in turn or at once")
     turns = np.arange(config.heads).reshape(-1, config.heads_at_once).tolist()
     test_rounds = math.ceil(config.eval_episodes / num_envs)
     began = time.perf_counter()
@@ -80,8 +80,8 @@ def train(config: Config, resume: bool = False) -> list[dict]:
             for cycle in range(0 if number == 1 else 1, config.cycles + 1):
                 with epoch.timed("collect"):  # 3: data generation
                     at_random = config.random_actions if cycle else 1
-                    noise = exploration(play_rng, noise_shape, config.noise, at_random)
-                    policy = acting_heads(agent, acting, num_envs, noise)
+                    drawn = exploration(play_rng, noise_shape, config.noise, at_random)
+                    policy = acting_heads(agent, acting, num_envs, drawn)
                     episodes, success = rollout(envs, policy, horizon)  # 4-8, 10, 11
                     slots = original_buffer.add(episodes, play_rng)  # 9: into B_o
                     # + HER+: the normaliser sees what the networks will, relabelled goals too

@@ -54,7 +54,8 @@ def priority_within_kinds(
 
 
 def mean_one_within_kinds(weight: np.ndarray, hindsight: np.ndarray) -> np.ndarray:
-    """The loss weights (B,) so that neither kind counts for more than its draws. (B,) bool."""
+    """Loss weights (B,) scaled to mean 1 within each kind, so that p does not count against
+    originals a second time. hindsight: (B,) bool."""
     weight = weight.copy()
     for kind in filter(np.any, (hindsight, ~hindsight)):
         weight[kind] /= weight[kind].mean()
