@@ -171,6 +171,7 @@ class ParallelEnvs:
         # machine with other runs, and stay free.
         cores = available_cores()
         pin = 1 < num_workers == len(cores) and hasattr(os, "sched_setaffinity")
+        self._pool = ThreadPoolExecutor(num_workers, initializer=numerics.begin_thread)
         # gymnasium would print the traceback of what a worker raises; it is raised here as well.
         self._logged, gym.logger.min_level = gym.logger.min_level, 50
         # A process that is not forked does not know what the user's own script has registered.
@@ -191,11 +192,7 @@ class ParallelEnvs:
         none waits for another: while one acts, the other steps. Returns the results in order."""
         if self.num_workers == 1:
             return [function(self.workers[0])]
-        pool = ThreadPoolExecutor(self.num_workers, initializer=numerics.begin_thread)
-        try:
-            return list(pool.map(function, self.workers))
-        finally:
-            pool.shutdown(wait=False)  # an environment may hang: __exit__ ends its process
+        return list(self._pool.map(function, self.workers))
 
     def reset(self, seed: int) -> None:
         """Seed environment i with seed + i."""
@@ -208,6 +205,7 @@ class ParallelEnvs:
         # After an error a worker may be in the middle of a step, or gone.
         for worker in self.workers:
             worker.close(now=kind is not None)
+        self._pool.shutdown()  # a thread whose environment hung ends with the process
         gym.logger.min_level = self._logged
 
 
