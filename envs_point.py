@@ -80,7 +80,7 @@ class PointMass(gym.Env):
     with next to no inertia; this one has none, and needs no MuJoCo.
     """
 
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 20}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
     threshold = 0.05
 
     def __init__(self, wall: bool = False, render_mode: str | None = None):
@@ -88,7 +88,6 @@ class PointMass(gym.Env):
         self.observation_space = goal_space(2, 2, bound=ROOM)
         self.action_space = Box(-1, 1, (2,), np.float32)
         self._xy = self._goal = (0.0, 0.0)
-        self._image = None
 
     def compute_reward(self, achieved_goal, desired_goal, info) -> np.ndarray:
         """Eq. (1). (..., 2) and (..., 2) -> (...), 0 within 0.05 of the goal, else -1."""
@@ -97,8 +96,6 @@ class PointMass(gym.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self._xy, self._goal = self._free_place(), self._free_place()
-        if self.render_mode == "human":
-            self.render()
         return self._observe(), {}
 
     def step(self, action):
@@ -111,29 +108,7 @@ class PointMass(gym.Env):
         self._xy = slide_along_wall(x, y, to_x, to_y) if self.wall else (to_x, to_y)
         dx, dy = self._xy[0] - self._goal[0], self._xy[1] - self._goal[1]
         success = math.sqrt(dx * dx + dy * dy) <= self.threshold
-        if self.render_mode == "human":
-            self.render()
         return self._observe(), float(success) - 1, False, False, {"is_success": success}
-
-    def render(self) -> np.ndarray | None:
-        """A picture of the room, (360, 360, 3) uint8; in mode "human", a window instead."""
-        picture = self._draw(360)
-        if self.render_mode != "human":
-            return picture
-        import matplotlib.pyplot as plt
-
-        if self._image is None:
-            self._image = plt.subplots()[1].imshow(picture)
-            self._image.axes.axis("off")
-        self._image.set_data(picture)
-        plt.pause(1 / self.metadata["render_fps"])
-
-    def close(self):
-        if self._image is not None:
-            import matplotlib.pyplot as plt
-
-            plt.close(self._image.figure)
-            self._image = None
 
     def _free_place(self) -> tuple[float, float]:
         while True:
@@ -148,7 +123,9 @@ class PointMass(gym.Env):
             "desired_goal": np.array(self._goal),
         }
 
-    def _draw(self, pixels: int) -> np.ndarray:
+    def render(self) -> np.ndarray:
+        """A picture of the room, (360, 360, 3) uint8."""
+        pixels = 360
         edge = ROOM + 2 * WALL_RADIUS
         x, y = np.meshgrid(*2 * [(np.arange(pixels) + 0.5) / pixels * 2 * edge - edge])
         y = -y  # pictures start at the top
@@ -172,14 +149,11 @@ class SparseReacher(ReacherEnv):
 
     Appendix A: the state is 8 numbers, cos and sin of the two joint angles, position and velocity
     of the fingertip in x and y; the goal is the target's x and y. Success within 0.02.
-    velocity: "fingertip" (the paper's text) or "joints" (the released code: two joint velocities
-    stand where the text has the fingertip's).
     """
 
-    def __init__(self, velocity: str = "fingertip", **kwargs):
-        if velocity not in ("fingertip", "joints"):
-            raise ValueError(f"velocity must be 'fingertip' or 'joints', not {velocity!r}")
-        self.velocity, self.threshold = velocity, 0.02
+    threshold = 0.02
+
+    def __init__(self, **kwargs):
         super().__init__(**kwargs)
         self.observation_space = goal_space(8, 2)
 
@@ -198,20 +172,15 @@ class SparseReacher(ReacherEnv):
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_comVel(self.model, self.data)
         angles, fingertip = self.data.qpos[:2], self.get_body_com("fingertip")[:2].copy()
-        velocity = (
-            self._fingertip_velocity() if self.velocity == "fingertip" else self.data.qvel[:2]
-        )
+        velocity = np.empty(6)  # angular, then linear, along the world's axes
+        body = mujoco.mjtObj.mjOBJ_XBODY, self.model.body("fingertip").id
+        mujoco.mj_objectVelocity(self.model, self.data, *body, velocity, 0)
+        state = np.cos(angles), np.sin(angles), fingertip, velocity[3:5]
         return {
-            "observation": np.concatenate([np.cos(angles), np.sin(angles), fingertip, velocity]),
+            "observation": np.concatenate(state),
             "achieved_goal": fingertip,
             "desired_goal": self.get_body_com("target")[:2].copy(),
         }
-
-    def _fingertip_velocity(self) -> np.ndarray:
-        spatial = np.empty(6)  # angular, then linear, along the world's axes
-        body = self.model.body("fingertip").id
-        mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_XBODY, body, spatial, 0)
-        return spatial[3:5]
 
 
 gym.register("PointMassEmptyEnv-v1", PointMass, max_episode_steps=50)

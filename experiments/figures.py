@@ -41,7 +41,7 @@ def read_runs(folder: Path) -> list[Run]:
         rows = read_rows(file.parent)
         if rows:
             columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-            config = replace(settings.load(file.parent), device="cpu", tensorboard=False)
+            config = replace(settings.load(file.parent), device="cpu")
             runs.append(Run(settings.complete(config), columns))
     return runs
 

@@ -36,7 +36,6 @@ from harness.tasks import make_env
 ROOT = Path(__file__).parent.parent
 OF_THE_SWEEP = ("env", "seed", "out")
 TYPES = {f.name: options.kind(f) for f in fields(Config) if f.name not in OF_THE_SWEEP}
-BOOLS = {"True": True, "False": False}
 
 
 def settings(text: str) -> dict:
@@ -47,8 +46,8 @@ def settings(text: str) -> dict:
         if name not in TYPES:
             raise UsageError(f"{name} is no setting; they are {', '.join(TYPES)}")
         try:
-            given[name] = BOOLS[value] if TYPES[name] is bool else TYPES[name](value)
-        except (KeyError, ValueError) as error:
+            given[name] = TYPES[name](value)
+        except ValueError as error:
             raise UsageError(f"{part}: not of type {TYPES[name].__name__}") from error
     return given
 

@@ -387,8 +387,7 @@ def test_what_a_sweep_consists_of(tmp_path):
         f"/FetchReach-v1/{name}/seed0" for name in ("vcp", "her_heads-1", "vcp_relabel_ratio-0.5")
     ]
     assert (runs[1].method, runs[1].heads, runs[1].epochs) == ("her", 1, 20)
-    given = {"tensorboard": True, "temperature": 5.0}
-    assert sweep.settings("tensorboard=True,temperature=5") == given
+    assert sweep.settings("heads=2,temperature=5") == {"heads": 2, "temperature": 5.0}
 
 
 @pytest.mark.parametrize(
@@ -398,7 +397,6 @@ def test_what_a_sweep_consists_of(tmp_path):
         "--variants heads=many",
         "--variants method=sac",
         "--variants heads=0",
-        "--variants tensorboard=true",
         "--seeds many",
         "--seeds 5-1",
         "--variants seed=1",

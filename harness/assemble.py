@@ -183,7 +183,7 @@ def make_replay(
 def restored(folder: Path) -> tuple[Parts, list[dict]]:
     """The parts of the run in `folder` after its last whole epoch, and its rows, on the CPU, also
     of a run from a GPU. UsageError if there is none."""
-    config = replace(settings.load(folder), device="cpu", tensorboard=False)
+    config = replace(settings.load(folder), device="cpu")
     parts = assemble(settings.complete(config))
     rows = records.restore(folder, asdict(parts.config), parts.state())
     if not rows and (epochs := records.epochs_done(folder)):

@@ -82,26 +82,22 @@ def parse(argv: list[str] | None) -> tuple[dict, argparse.Namespace]:
         add_help=False,
     )
     parser.error = fail
-    groups = {name: parser.add_argument_group(name) for name in (settings.RUN, settings.SCHEDULE)}
-    groups |= {
-        f.metadata["group"]: None for f in fields(Config) if f.metadata["group"] not in groups
-    }
-    for name in groups:
-        groups[name] = groups[name] or parser.add_argument_group(name)
-    run = groups[settings.RUN]
-    run.add_argument("-h", "--help", action="help", help="show this and stop")
-    run.add_argument("--resume", metavar="DIR", help="go on with the run in DIR")
-    run.add_argument("--play", metavar="DIR", help="play what the run in DIR, or a policy, learned")
-    run.add_argument("--gif", metavar="FILE", help="with --play: write an animation, no window")
-    run.add_argument("--policy", metavar="FILE.npz", help="with --play: write the best head's")
+    do = parser.add_argument_group("what to do, but to train")
+    do.add_argument("-h", "--help", action="help", help="show this and stop")
+    do.add_argument("--resume", metavar="DIR", help="go on with the run in DIR")
+    do.add_argument("--play", metavar="DIR", help="play what the run in DIR, or a policy, learned")
+    do.add_argument("--gif", metavar="FILE", help="with --play: write an animation, no window")
+    do.add_argument("--policy", metavar="FILE.npz", help="with --play: write the best head's")
     for f in fields(Config):
-        how = {"default": argparse.SUPPRESS, "help": f.metadata["help"].replace("%", "%%")}
-        if settings.kind(f) is bool:
-            how["action"] = "store_true"
-        else:
-            how |= {"type": settings.kind(f), "choices": f.metadata["choices"]}
-            how["help"] += "" if f.default is None else f" (default: {f.default})"
-        groups[f.metadata["group"]].add_argument(settings.flag(f.name), **how)
+        if f.name in settings.GROUPS:
+            group = parser.add_argument_group(settings.GROUPS[f.name])
+        group.add_argument(
+            settings.flag(f.name),
+            type=settings.kind(f),
+            choices=f.metadata["choices"],
+            default=argparse.SUPPRESS,
+            help=f.metadata["help"] + ("" if f.default is None else f" (default: {f.default})"),
+        )
     with contextlib.suppress(AttributeError):  # 𝒯 on a terminal that is not UTF-8
         sys.stdout.reconfigure(errors="replace")
     given = vars(parser.parse_args(argv))

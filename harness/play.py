@@ -119,11 +119,9 @@ def episode(
     mode or "human", ends when it has been at its goal for HELD steps."""
     obs, _ = env.reset(seed=seed)
     frames, held = [], 0
-    for t in range(env.horizon):
+    for _ in range(env.horizon):
         if mode == "rgb_array":
             frames.append(env.render())
-        if mode == "human" and t == 0:
-            hide_menu(env)
         rows = obs["observation"][None, None], obs["desired_goal"][None, None]
         action = agent.act(*rows, slice(head, head + 1))[0, 0]
         obs, *_, info = env.step(action)
@@ -131,13 +129,6 @@ def episode(
         if mode and held == HELD:
             break
     return held > 0, frames
-
-
-def hide_menu(env: Border) -> None:
-    """Take MuJoCo's list of keys off its window, as the key H does."""
-    viewer = getattr(getattr(env.unwrapped, "mujoco_renderer", None), "viewer", None)
-    if viewer is not None:
-        viewer._hide_menu = True
 
 
 # ------------------------------------------------------------------------------ policies

@@ -44,16 +44,9 @@ COLUMNS = [
 ]
 TIMING_COLUMNS = {name for name in COLUMNS if name.endswith("_seconds")}
 PACKAGES = ("numpy", "torch", "gymnasium", "gymnasium-robotics", "mujoco")
-CHECKPOINT, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
-FORMAT = 5  # of checkpoints; others are refused
-MAY_CHANGE = (
-    "epochs",
-    "out",
-    "device",
-    "threads",
-    "num_workers",
-    "tensorboard",
-)  # when a run is resumed
+CHECKPOINT = "checkpoint.pt"
+FORMAT = 6  # of checkpoints; others are refused
+MAY_CHANGE = ("epochs", "out", "device", "threads", "num_workers")  # when a run is resumed
 
 
 def to_type(option: str, folder: Path) -> str:
@@ -129,8 +122,11 @@ def _refuse_another(folder: Path, resume: bool) -> None:
 
 
 def save(folder: Path, config: dict, rows: list[dict], parts: tuple) -> None:
-    """The end of an epoch: checkpoint.pt, then progress.csv and curve.png."""
+    """The end of an epoch: checkpoint.pt, then progress.csv and curve.png. FloatingPointError, and
+    nothing written, for NaN or Inf in the networks."""
     states = as_tensors([part.state_dict() for part in parts])
+    if not all(p.isfinite().all() for net in states[0]["networks"] for p in net):
+        raise FloatingPointError("NaN or Inf in the networks")
     save_checkpoint(folder, {"config": config, "rows": rows, "parts": states})
     write_rows(folder, rows, config)
 
@@ -145,7 +141,7 @@ def as_tensors(state):
 
 
 def write_rows(folder: Path, rows: list[dict], config: dict) -> None:
-    """progress.csv and, if there are rows, curve.png and what TensorBoard reads."""
+    """progress.csv and, if there are rows, curve.png."""
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, COLUMNS)
     table.writeheader()
@@ -153,8 +149,6 @@ def write_rows(folder: Path, rows: list[dict], config: dict) -> None:
     write_whole(folder / "progress.csv", lambda file: file.write(text.getvalue().encode()))
     if rows:
         _draw_curve(folder, rows, config)
-        if config["tensorboard"]:
-            _write_tensorboard(folder / "tensorboard", rows)
 
 
 def read_rows(folder: Path) -> list[dict[str, float]]:
@@ -172,7 +166,7 @@ def epochs_done(folder: Path) -> int:
 
 
 def save_checkpoint(folder: Path, state: dict) -> None:
-    """checkpoint.pt, keeping the one before it. state: tensors and plain Python alone."""
+    """checkpoint.pt. state: tensors and plain Python alone."""
 
     def write(file):
         try:
@@ -180,11 +174,7 @@ def save_checkpoint(folder: Path, state: dict) -> None:
         except RuntimeError as error:  # torch's own, from closing its archive on a full disk
             raise error.__context__ if isinstance(error.__context__, OSError) else error from None
 
-    path = folder / CHECKPOINT
-    write_whole(folder / "checkpoint.new.pt", write)
-    if path.exists():
-        os.replace(path, folder / PREVIOUS)
-    os.replace(folder / "checkpoint.new.pt", path)
+    write_whole(folder / CHECKPOINT, write)
 
 
 def read_checkpoint(path: Path) -> dict:
@@ -196,38 +186,31 @@ def read_checkpoint(path: Path) -> dict:
     saved = torch.load(path, map_location="cpu", weights_only=True)
     if saved.get("format") != FORMAT:
         raise UsageError(f"{path} is a checkpoint of another version")
-    if not all(p.isfinite().all() for net in saved["parts"][0]["networks"] for p in net):
-        raise FloatingPointError("NaN or Inf in its networks")
     return saved
 
 
 def restore(folder: Path, config: dict, parts: tuple) -> list[dict]:
-    """Bring the parts to the state of the newest checkpoint that is whole. Returns its rows, none
-    if there is no checkpoint yet. UsageError if none is whole, and for one of another version or of
-    other settings than `config`, those aside that a resumed run may change."""
-    paths = [folder / name for name in ("checkpoint.new.pt", CHECKPOINT, PREVIOUS)]
-    found = [path for path in paths if path.exists()]
-    for path in found:
-        try:
-            saved = read_checkpoint(path)
-            differ = [
-                k for k, v in saved["config"].items() if k not in MAY_CHANGE and config[k] != v
-            ]
-            if differ:
-                raise UsageError(f"{path} was made with another {differ[0]} than config.json says")
-            if _sizes(saved["parts"]) != _sizes([part.state_dict() for part in parts]):
-                changed = "networks or episodes of other sizes, as if the environment had changed"
-                raise UsageError(f"{path} has {changed}")
-            for part, state in zip(parts, saved["parts"], strict=True):
-                part.load_state_dict(state)
-            return saved["rows"]
-        except UsageError:
-            raise
-        except Exception as error:  # whatever a damaged file leads to
-            print(f"{path} is damaged ({type(error).__name__}), trying the one before")
-    if found:
-        raise UsageError(f"no checkpoint in {folder} can be read: they are damaged")
-    return []
+    """Bring the parts to the state of the checkpoint. Returns its rows, none if there is none yet.
+    UsageError for a damaged one, and for one of another version or of other settings than `config`,
+    those aside that a resumed run may change."""
+    path = folder / CHECKPOINT
+    if not path.exists():
+        return []
+    try:
+        saved = read_checkpoint(path)
+        differ = [k for k, v in saved["config"].items() if k not in MAY_CHANGE and config[k] != v]
+        if differ:
+            raise UsageError(f"{path} was made with another {differ[0]} than config.json says")
+        if _sizes(saved["parts"]) != _sizes([part.state_dict() for part in parts]):
+            changed = "networks or episodes of other sizes, as if the environment had changed"
+            raise UsageError(f"{path} has {changed}")
+        for part, state in zip(parts, saved["parts"], strict=True):
+            part.load_state_dict(state)
+    except UsageError:
+        raise
+    except Exception as error:  # whatever a damaged file leads to
+        raise UsageError(f"{path} is damaged ({type(error).__name__})") from error
+    return saved["rows"]
 
 
 def _sizes(states: list[dict]) -> list:
@@ -235,19 +218,6 @@ def _sizes(states: list[dict]) -> list:
     agent, original_buffer, *_ = states
     shapes = [p.shape for network in agent["networks"] for p in network]
     return shapes + [x.shape[1:] for x in original_buffer.values()]
-
-
-def _write_tensorboard(folder: Path, rows: list[dict]) -> None:
-    """The numbers of all rows, by epoch, as the one file in `folder`."""
-    from torch.utils.tensorboard import SummaryWriter
-
-    older = [*folder.glob("events.*")]
-    with SummaryWriter(folder, filename_suffix=f".{len(rows)}") as board:
-        for row in rows:
-            for name, value in row.items():
-                board.add_scalar(name, value, row["epoch"])
-    for file in older:
-        file.unlink()
 
 
 def _draw_curve(folder: Path, rows: list[dict], config: dict) -> None:

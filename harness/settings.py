@@ -1,9 +1,8 @@
 """Every setting of a run, the paper's schedule, and what is refused."""
 
-import importlib.util
 import math
-import operator
 import re
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -16,94 +15,84 @@ from harness.records import MAY_CHANGE
 from vcp import IMPORTANCE, PRIORITIES
 
 METHODS = ["vcp", "her", "herebp", "cher", "dtgsh"]
-RUN, SCHEDULE, VCP = "the run", "Appendix B: schedule, HER and DDPG", "Section 4: VCP"
-COMPARISON, MACHINE = "Section 5: comparisons and ablations", "the machine"
+GROUPS = {  # of --help, by the first setting of each
+    "env": "the run",
+    "epochs": "Appendix B: schedule, HER and DDPG",
+    "heads": "Section 4: VCP",
+    "method": "Section 5: comparisons and ablations",
+    "device": "the machine",
+}
 
 
-def setting(default: Any, group: str, text: str, choices: list[str] | None = None, **limits) -> Any:
-    """A field of Config: where --help shows it, what it says there, and the values it may have:
-    one of `choices`, `least` or more, more than `above`, `most` or less."""
-    metadata = {"group": group, "help": text, "choices": choices, "limits": limits}
-    return field(default=default, metadata=metadata)
+def setting(default: Any, text: str, choices: Iterable[str] | None = None, **limits) -> Any:
+    """A field of Config: what --help says of it, and the values it may have: one of `choices`,
+    `least` or more, more than `above`, `most` or less."""
+    choices = choices and [*choices]
+    return field(default=default, metadata={"help": text, "choices": choices, "limits": limits})
 
 
 @dataclass
 class Config:
-    """Every setting of a run. NOTES.md says which of them the paper gives, and where."""
+    """Every setting of a run. NOTES.md says which of them the paper gives, and where. Where the
+    default is None, `complete` fills it in."""
 
-    env: str = setting("FetchReach-v1", RUN, "the paper's name, a goal environment's id, module:ID")
-    method: str = setting("vcp", COMPARISON, "the method that decides what is replayed", METHODS)
-    seed: int = setting(0, RUN, "the run's random numbers follow from it", least=0, most=2**32 - 1)
-    out: str | None = setting(
-        None, RUN, "the run's folder (default: runs/ENV/METHOD/seedSEED, METHOD with what differs)"
-    )
-    tensorboard: bool = setting(False, RUN, "write the rows for TensorBoard, which must be there")
-    # Appendix B; None is filled in by `complete`
-    epochs: int = setting(50, SCHEDULE, "epochs, M in Algorithm 2", least=1)
-    cycles: int | None = setting(
-        None, SCHEDULE, "collections an epoch, n (default: 5, 15 or 50 by environment)", least=1
-    )
-    updates: int | None = setting(
-        None, SCHEDULE, "updates of each head a cycle (default: 5 or 40 by environment)", least=1
-    )
+    env: str = setting("FetchReach-v1", "the paper's name, a goal environment's id, or module:ID")
+    seed: int = setting(0, "the run's random numbers follow from it", least=0, most=2**32 - 1)
+    out: str | None = setting(None, "the run's folder (default: runs/ENV/VARIANT/seedSEED)")
+
+    epochs: int = setting(50, "epochs, M in Algorithm 2", least=1)
+    cycles: int | None = setting(None, "collections an epoch, n (default: 5, 15 or 50)", least=1)
+    updates: int | None = setting(None, "updates of each head a cycle (default: 5 or 40)", least=1)
     batch_size: int | None = setting(
-        None, SCHEDULE, "transitions in a head's mini-batch (default: 64 or 256)", least=1
+        None, "transitions in a head's mini-batch (default: 64 or 256)", least=1
     )
     episode_length: int | None = setting(
-        None, SCHEDULE, "steps of an episode, T (default: 50, or the environment's own)", least=1
+        None, "steps of an episode, T (default: 50, or the environment's own)", least=1
     )
-    buffer_size: int = setting(1_000_000, SCHEDULE, "transitions that B_o holds", least=1)
-    relabel_ratio: float = setting(
-        0.8, SCHEDULE, "share of transitions with a hindsight goal, k/(1+k)", least=0, most=1
-    )
-    learning_rate: float = setting(1e-3, SCHEDULE, "Adam's, of actors and critics", above=0)
+    buffer_size: int = setting(1_000_000, "transitions that B_o holds", least=1)
+    relabel_ratio: float = setting(0.8, "share of hindsight goals, k/(1+k)", least=0, most=1)
+    learning_rate: float = setting(1e-3, "Adam's, of actors and critics", above=0)
     heads_at_once: int | None = setting(
-        None, SCHEDULE, "heads that step together (default: 1, or all, by updates)", least=1
+        None, "heads that step together (default: 1, or all where updates are many)", least=1
     )
-    polyak: float = setting(0.95, SCHEDULE, "what a target network keeps, a cycle", least=0, most=1)
-    noise: float = setting(0.2, SCHEDULE, "standard deviation of the exploration noise", least=0)
-    random_actions: float = setting(
-        0.3, SCHEDULE, "share of actions that are uniformly random", least=0, most=1
-    )
-    action_penalty: float = setting(
-        1.0, SCHEDULE, "weight of mean(μ²) in the actor's loss", least=0
-    )
-    eval_episodes: int = setting(
-        160, SCHEDULE, "test episodes an epoch; rounded up to the same for each head", least=1
-    )
-    heads: int = setting(16, VCP, "actors and critics, K", least=1)
+    polyak: float = setting(0.95, "what a target network keeps, a cycle", least=0, most=1)
+    noise: float = setting(0.2, "standard deviation of the exploration noise", least=0)
+    random_actions: float = setting(0.3, "share of uniformly random actions", least=0, most=1)
+    action_penalty: float = setting(1.0, "weight of mean(μ²) in the actor's loss", least=0)
+    eval_episodes: int = setting(160, "test episodes an epoch, as many for each head", least=1)
+
+    heads: int = setting(16, "actors and critics, K", least=1)
     temperature: float = setting(
-        9.0, VCP, "𝒯 in Eq. (4); the paper takes one of 1, 5, 9, 11, 15", least=0
+        9.0, "𝒯 in Eq. (4); the paper takes one of 1, 5, 9, 11, 15", least=0
     )
     importance: str = setting(
-        "paper", VCP, "loss weights w_i: Section 4.3's, Schaul et al.'s, or all 1", [*IMPORTANCE]
+        "paper", "loss weights w_i: Section 4.3's, Schaul et al.'s, or all 1", IMPORTANCE
     )
     scored_per_drawn: float = setting(
-        1.0, VCP, "transitions that Algorithm 1 scores for each one drawn", above=0
+        1.0, "transitions that Algorithm 1 scores for each one drawn", above=0
     )
     her_buffer_capacity: int | None = setting(
-        None, VCP, "transitions that B_h holds (default: as many as a cycle draws)", least=1
+        None, "transitions that B_h holds (default: as many as a cycle draws)", least=1
     )
+
+    method: str = setting("vcp", "the method that decides what is replayed", METHODS)
     priority: str = setting(
         "consistency",
-        COMPARISON,
         "Eq. (4), an ablation of Section 5.6, or Eq. (4) within each kind (not in the paper)",
-        [*PRIORITIES],
+        PRIORITIES,
     )
-    acting_head: str = setting(
-        "all", COMPARISON, "the heads that collect episodes, Section 5.6", ["all", "one"]
-    )
+    acting_head: str = setting("all", "who collects episodes, Section 5.6", ["all", "one"])
+
     device: str = setting(
         "auto",
-        MACHINE,
         "where the networks are; auto: a GPU if any, and if all heads step together",
         ["auto", "cpu", "cuda"],
     )
     threads: int | None = setting(
-        None, MACHINE, "threads that train and score (default: one a core)", least=1
+        None, "threads that train and score (default: one a core)", least=1
     )
     num_workers: int | None = setting(
-        None, MACHINE, "processes for the environments (default: one a core, 4 at most)", least=1
+        None, "processes for the environments (default: one a core, 4 at most)", least=1
     )
 
 
@@ -173,8 +162,6 @@ def complete(config: Config) -> Config:
         config.device = "cuda" if together and torch.cuda.is_available() else "cpu"
     if config.device == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda: no CUDA device was found")
-    if config.tensorboard and importlib.util.find_spec("tensorboard") is None:
-        raise UsageError("--tensorboard: the package is missing (pip install tensorboard)")
     if config.out is None:
         config.out = f"runs/{default_folder(config)}"
     return config
@@ -191,13 +178,12 @@ def checked(f, value: Any) -> Any:
         raise UsageError(f"{what} must be one of {', '.join(f.metadata['choices'])}, not {value!r}")
     if wanted is float and not math.isfinite(value):
         raise UsageError(f"{what} must be a finite number, not {value}")
-    for limit, refused, words in (
-        ("least", operator.lt, "{} or more"),
-        ("above", operator.le, "above {}"),
-        ("most", operator.gt, "{} or less"),
-    ):
-        if limit in limits and refused(value, limits[limit]):
-            raise UsageError(f"{what} must be {words.format(limits[limit])}, not {value}")
+    if "least" in limits and value < limits["least"]:
+        raise UsageError(f"{what} must be {limits['least']} or more, not {value}")
+    if "above" in limits and value <= limits["above"]:
+        raise UsageError(f"{what} must be above {limits['above']}, not {value}")
+    if "most" in limits and value > limits["most"]:
+        raise UsageError(f"{what} must be {limits['most']} or less, not {value}")
     return value
 
 
@@ -232,9 +218,8 @@ def load(folder: Path) -> Config:
     """The settings of the run in `folder`. UsageError if it holds none, or another version's."""
     try:
         saved = records.read_config(folder)
-        if saved.get("faithful") is False:  # an option of earlier runs
-            del saved["faithful"]
-        return Config(**saved)
+        older = {name for name in ("faithful", "tensorboard") if saved.get(name) is False}
+        return Config(**{name: value for name, value in saved.items() if name not in older})
     except (TypeError, AttributeError) as error:
         raise UsageError(f"{folder} holds a run of another version ({error})") from error
 
@@ -255,5 +240,5 @@ def flag(name: str) -> str:
 
 
 def kind(f) -> type:
-    """bool, int, float or str, for a field of Config that may also be None."""
-    return next(t for t in (bool, int, float, str) if t in (f.type, *get_args(f.type)))
+    """int, float or str, for a field of Config that may also be None."""
+    return next(t for t in (int, float, str) if t in (f.type, *get_args(f.type)))

@@ -239,7 +239,6 @@ def test_help_names_every_option_and_default(capsys):
         "--play",
         "--gif",
         "--policy",
-        "--tensorboard",
     ):
         assert name in text
     assert "𝒯 in Eq. (4)" in text and "(default: 9.0)" in text and "(default: 16)" in text

@@ -11,11 +11,10 @@ import torch
 from PIL import Image
 
 from ensemble import EnsembleDDPG
-from envs_point import PointMass
 from harness import play as module
 from harness import records
 from harness.errors import UsageError
-from harness.play import episode, hide_menu, play, read_policy
+from harness.play import episode, play, read_policy
 from harness.tasks import make_env
 
 
@@ -111,21 +110,6 @@ def test_what_is_looked_at_ends_at_the_goal_and_what_is_counted_does_not():
     assert success and 10 <= len(frames) < 40
     success, frames = episode(shown, away, 0, 0, "rgb_array")
     assert not success and len(frames) == 50
-
-
-def test_mujocos_window_comes_without_its_menu(monkeypatch):
-    viewer = SimpleNamespace(_hide_menu=False)
-    renderer = SimpleNamespace(viewer=viewer)
-    hide_menu(SimpleNamespace(unwrapped=SimpleNamespace(mujoco_renderer=renderer)))
-    assert viewer._hide_menu
-    hide_menu(make_env("PointMassEmptyEnv-v1"))  # it has none
-    hidden = []
-    monkeypatch.setattr(module, "hide_menu", hidden.append)
-    monkeypatch.setattr(PointMass, "render", lambda self: None)
-    env = make_env("PointMassEmptyEnv-v1", render_mode="human")
-    still = SimpleNamespace(act=lambda obs, goal, heads: 0 * obs)
-    episode(env, still, 0, 0, "human")
-    assert hidden == [env]
 
 
 def test_playing_takes_one_thread(whole, monkeypatch):

@@ -1,6 +1,5 @@
 """Tests of the settings and the schedule."""
 
-import importlib.util
 import math
 
 import pytest
@@ -92,9 +91,3 @@ def test_a_missing_device_is_named():
 def test_a_gpu_is_taken_where_it_is_faster(given, device, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert settings.complete(Config(**given)).device == device
-
-
-def test_a_missing_tensorboard_is_named(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(UsageError, match="pip install tensorboard"):
-        settings.complete(Config(tensorboard=True))

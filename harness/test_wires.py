@@ -185,7 +185,6 @@ def test_every_setting_is_in_the_runs_name_or_may_change():
         "device",
         "threads",
         "num_workers",
-        "tensorboard",
         "method",
     }
     for f in fields(Config):
