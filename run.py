@@ -18,7 +18,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +27,7 @@ from harness import cli, numerics, records
 from harness.assemble import assemble
 from harness.epoch import Epoch
 from harness.settings import Config, complete, scored_a_sweep
-from harness.workers import ParallelEnvs, Worker
+from harness.workers import ParallelEnvs
 from her import relabel_future
 from vcp import score, update_her_buffer
 
@@ -136,37 +135,31 @@ def randomness(seed: int, epoch: int) -> tuple:
 # ------------------------------------------------------------------------------ lines 4-11
 
 
+@numerics.small_calls()
 def rollout(envs: ParallelEnvs, policy: Policy, horizon: int) -> tuple[dict, np.ndarray]:
     """Algorithm 2, lines 4-11: an episode in each environment, all at once.
 
     Returns the episodes, with the arrays of her.EpisodeBuffer, and is_success at the last step,
-    (N,). The workers ask the policy at their own pace. FloatingPointError for NaN or Inf in the
-    actions.
+    (N,). FloatingPointError for NaN or Inf in the actions.
     """
-    with numerics.small_calls():
-        parts = envs.each(partial(episodes_of, policy=policy, horizon=horizon))
-    parts, successes = zip(*parts, strict=True)
-    episodes = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return episodes, np.concatenate(successes)
-
-
-def episodes_of(worker: Worker, policy: Policy, horizon: int) -> tuple[dict, np.ndarray]:
-    """`rollout` for the environments of one worker."""
-    steps, actions = [worker.reset()], []  # 5: goals and initial states
-    goal = steps[0]["desired_goal"]
-    for t in range(horizon):  # 6: T steps
-        action = np.float32(policy(t, worker.which, steps[-1]["observation"], goal))  # 7: a_t
-        if not np.isfinite(action).all():
-            raise FloatingPointError("NaN or Inf in the actions, so in the networks")
-        obs, success = worker.step(action)  # 8: s_{t+1}; Eq. (1) gives r_t when it is needed
-        steps.append(obs)
-        actions.append(action)
-    episodes = {
-        "obs": np.stack([obs["observation"] for obs in steps], axis=1),  # (n, T+1, O)
-        "achieved_goal": np.stack([obs["achieved_goal"] for obs in steps], axis=1),
-        "desired_goal": goal,  # (n, G)
-        "action": np.stack(actions, axis=1),  # (n, T, A)
-    }
+    episodes, success = envs.empty_episodes(horizon), np.empty(envs.num_envs, bool)
+    for half in envs.halves:
+        half.reset()  # 5: goals and initial states
+    for t in range(horizon + 1):  # 6: T steps
+        for half in envs.halves:  # while one acts, the other's environments step
+            n = half.which
+            seen, success[n] = half.wait()
+            episodes["obs"][n, t] = seen["observation"]
+            episodes["achieved_goal"][n, t] = seen["achieved_goal"]
+            episodes["desired_goal"][n] = seen["desired_goal"]
+            if t < horizon:
+                # 7: a_t
+                action = policy(t, n, episodes["obs"][n, t], episodes["desired_goal"][n])
+                if not np.isfinite(action).all():
+                    raise FloatingPointError("NaN or Inf in the actions, so in the networks")
+                episodes["action"][n, t] = action
+                # 8: s_{t+1}; Eq. (1) gives r_t when it is needed
+                half.step(episodes["action"][n, t])
     return episodes, success
 
 
@@ -189,7 +182,7 @@ def acting_heads(agent: EnsembleDDPG, acting: int, num_envs: int, drawn=None) ->
 def exploration(rng: np.random.Generator, shape: tuple, noise: float, at_random: float) -> tuple:
     """HER's exploration, which is not in the paper: Gaussian noise of that standard deviation, and
     some actions uniform instead, a share of `at_random`. It is drawn before the episodes, shape
-    (T, N, A), as the workers go on at their own pace, which must not change who gets what.
+    (T, N, A), so that the number of workers does not change which environment gets what.
     Returns the noise, the uniform actions and where these are taken."""
     gaussian, uniform = noise * rng.standard_normal(shape), rng.uniform(-1, 1, shape)
     return gaussian, uniform, rng.random((*shape[:2], 1)) < at_random

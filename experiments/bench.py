@@ -24,7 +24,7 @@ from harness.assemble import make_replay
 from harness.numerics import begin_thread, fast_products, one_thread
 from harness.settings import METHODS, Config, complete
 from harness.tasks import examine, make_env
-from harness.workers import ParallelEnvs, available_cores, whole_heads
+from harness.workers import ParallelEnvs, available_cores, number_of_workers
 from her import EpisodeBuffer
 from vcp import score, update_her_buffer
 
@@ -147,7 +147,8 @@ def bench_collection(repeats: int, num_envs: int = 16, horizon: int = 50) -> Non
             for action in actions:
                 env.step(action)
 
-        with ParallelEnvs(name, num_envs, whole_heads(None, num_envs, 16)) as envs:
+        workers = number_of_workers(None, num_envs)
+        with ParallelEnvs(name, num_envs, workers, in_halves=workers > 1) as envs:
             envs.reset(0)
             t = in_turn({"play": play, "raw": raw}, repeats)
         rate, raw_rate = num_envs * horizon / t["play"], horizon / t["raw"]

@@ -18,7 +18,7 @@ from harness.errors import UsageError
 from harness.gpu import EnsembleOnGPU, HERBufferOnGPU
 from harness.settings import Config
 from harness.tasks import Task, before_training, examine, make_env
-from harness.workers import ParallelEnvs, available_cores, whole_heads
+from harness.workers import ParallelEnvs, available_cores, number_of_workers
 from her import EpisodeBuffer
 from vcp import HERBuffer
 
@@ -71,12 +71,13 @@ class Parts:
     @contextmanager
     def envs(self) -> Iterator[ParallelEnvs]:
         """The environments, in their processes. Afterwards the one of the task is closed too."""
-        workers = whole_heads(self.config.num_workers, self.num_envs, self.config.heads)
-        length = self.config.episode_length
+        config, workers = self.config, number_of_workers(self.config.num_workers, self.num_envs)
+        # each half has the environments of whole heads, or of the only one
+        halves = workers % 2 == 0 and (config.heads % 2 == 0 or config.heads == 1)
         with closing(self.task.env):
             with before_training():
                 parallel = ParallelEnvs(
-                    self.config.env, self.num_envs, workers, episode_length=length
+                    config.env, self.num_envs, workers, halves, episode_length=config.episode_length
                 )
             with parallel as envs:
                 yield envs

@@ -6,7 +6,6 @@ as one; and acting, which is many small calls, stays on the CPU. The two classes
 that they are made from, and are called in the same way; `assemble` takes them for `--device cuda`.
 """
 
-import threading
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -131,7 +130,6 @@ class EnsembleOnGPU(EnsembleDDPG):
     def __init__(self, *sizes, **settings):
         super().__init__(*sizes, **settings)
         self._player = EnsembleDDPG(*sizes, **{**settings, "device": "cpu"})
-        self._lock = threading.Lock()
         self._batch = None
         self._begin()
 
@@ -152,15 +150,14 @@ class EnsembleOnGPU(EnsembleDDPG):
 
     @torch.no_grad()
     def act(self, obs: np.ndarray, goal: np.ndarray, heads: slice = slice(None)) -> np.ndarray:
-        with self._lock:  # several workers ask
-            now = (self._steps, self.normalizer.count)
-            if self._followed != now:
-                here, there = self.actor, self._player.actor
-                for p, q in zip(there.trunk + there.stacks, here.trunk + here.stacks, strict=True):
-                    p.copy_(q)
-                self._player.normalizer.mean.copy_(self.normalizer.mean)
-                self._player.normalizer.std.copy_(self.normalizer.std)
-                self._followed = now
+        now = (self._steps, self.normalizer.count)
+        if self._followed != now:
+            here, there = self.actor, self._player.actor
+            for p, q in zip(there.trunk + there.stacks, here.trunk + here.stacks, strict=True):
+                p.copy_(q)
+            self._player.normalizer.mean.copy_(self.normalizer.mean)
+            self._player.normalizer.std.copy_(self.normalizer.std)
+            self._followed = now
         return self._player.act(obs, goal, heads)
 
     def update_heads(self, heads: Sequence[int], batches: list[Batch], map=map) -> torch.Tensor:

@@ -92,7 +92,7 @@ class Config:
         None, "threads that train and score (default: one a core)", least=1
     )
     num_workers: int | None = setting(
-        None, "processes for the environments (default: one a core, 4 at most)", least=1
+        None, "processes for the environments (default: one a core)", least=1
     )
 
 

@@ -4,13 +4,15 @@ import os
 import signal
 import time
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 import run
+from envs_point import PointMass
 from harness.tasks import make_env
 from harness.testing import random_agent
-from harness.workers import ParallelEnvs, read_joints_by_index, whole_heads
+from harness.workers import ParallelEnvs, number_of_workers, read_joints_by_index
 
 
 @pytest.mark.parametrize("name", ["FetchReach-v1", "PointMassWallEnv-v1"])
@@ -21,7 +23,7 @@ def test_workers_play_the_same_as_one_process(name):
     action_dim = env.action_space.shape[0]
     agent = random_agent(num_heads=4, obs_dim=obs_dim, goal_dim=goal_dim, action_dim=action_dim)
     for workers in (1, 2, 4):
-        with ParallelEnvs(name, 8, workers) as envs:
+        with ParallelEnvs(name, 8, workers, in_halves=workers > 1) as envs:
             assert envs.num_workers == workers
             envs.reset(7)
             rng = np.random.default_rng(0)
@@ -40,51 +42,46 @@ def test_workers_play_the_same_as_one_process(name):
         assert array.dtype == np.float32
 
 
-def test_workers_hold_whole_heads_or_a_part_of_one():
-    for heads, num_envs, asked, made in (
-        (16, 16, 5, 4),
-        (3, 18, 2, 1),
-        (3, 18, 9, 9),
-        (1, 16, 3, 2),
-    ):
-        with ParallelEnvs(
-            "PointMassEmptyEnv-v1", num_envs, whole_heads(asked, num_envs, heads)
-        ) as envs:
-            assert envs.num_workers == made
-            rows = [np.arange(num_envs)[worker.which] for worker in envs.workers]
-            np.testing.assert_array_equal(np.concatenate(rows), np.arange(num_envs))
-
-
-def test_many_cores_do_not_make_many_workers(monkeypatch):
-    for cores, workers in ((1, 1), (2, 2), (3, 2), (4, 4), (16, 4)):
+def test_the_environments_are_shared_evenly(monkeypatch):
+    for num_envs, asked, made in ((16, 5, 4), (18, 4, 3), (18, 9, 9), (16, 99, 16), (3, 2, 1)):
+        assert number_of_workers(asked, num_envs) == made
+    for cores, made in ((1, 1), (2, 2), (3, 2), (16, 16), (64, 16)):
         monkeypatch.setattr("harness.workers.available_cores", lambda n=cores: [*range(n)])
-        assert whole_heads(None, 16, 16) == workers
-        assert whole_heads(16, 16, 16) == 16
+        assert number_of_workers(None, 16) == made
+    for workers, in_halves, rows in ((1, False, [6]), (3, False, [6]), (2, True, [3, 3])):
+        with ParallelEnvs("PointMassEmptyEnv-v1", 6, workers, in_halves) as envs:
+            which = [np.arange(6)[half.which] for half in envs.halves]
+            assert [len(part) for part in which] == rows
+            np.testing.assert_array_equal(np.concatenate(which), np.arange(6))
 
 
-def test_no_worker_waits_for_another():
-    """While one is slow, the other plays on to the end."""
-    order = []
+def test_one_half_acts_while_the_other_steps():
+    """20 steps of 10 ms, in which the networks need 10 ms for each half, take no 600 ms."""
 
-    def policy(t, rows, obs, goal):
-        if rows.start == 0:
-            time.sleep(0.02)
-        order.append(rows.start)
-        return np.zeros((2, 2))
+    class Slow(PointMass):
+        def step(self, action):
+            time.sleep(0.01)
+            return super().step(action)
 
-    with ParallelEnvs("PointMassEmptyEnv-v1", 4, 2) as envs:
+    def policy(t, which, obs, goal):
+        time.sleep(0.01)
+        return np.zeros((1, 2))
+
+    gym.register("Slow-v0", Slow, max_episode_steps=50)
+    with ParallelEnvs("Slow-v0", 2, 2, in_halves=True) as envs:
         envs.reset(0)
+        run.rollout(envs, policy, 2)
+        began = time.perf_counter()
         run.rollout(envs, policy, 20)
-    assert order.count(0) == order.count(2) == 20
-    assert order[:20].count(2) > 15
+    assert time.perf_counter() - began < 0.53
 
 
-def test_a_process_ends_though_a_thread_has_read_half_of_its_answer():
+def test_a_process_ends_though_half_of_its_answer_has_been_read():
     with pytest.raises(ZeroDivisionError), ParallelEnvs("PointMassEmptyEnv-v1", 4, 2) as envs:
         envs.reset(0)
-        vector = envs.workers[0]._env
-        (process,), (pipe,) = vector.processes, vector.parent_pipes
-        vector.step_async(np.zeros((1, 2, 2)))
+        vector = envs.halves[0]._env
+        process, pipe = vector.processes[0], vector.parent_pipes[0]
+        vector.step_async(np.zeros((2, 2, 2)))
         assert len(os.read(pipe.fileno(), 4)) == 4  # the answer's length
         raise ZeroDivisionError
     assert not process.is_alive()
@@ -95,7 +92,7 @@ def test_workers_have_a_core_each_and_the_main_process_keeps_all():
     cores, ctrl_c = os.sched_getaffinity(0), signal.getsignal(signal.SIGINT)
     with ParallelEnvs("PointMassEmptyEnv-v1", 4 * len(cores), len(cores)) as envs:
         several = len(cores) > 1
-        pids = [p.pid for w in envs.workers for p in w._env.processes] if several else []
+        pids = [p.pid for half in envs.halves for p in half._env.processes] if several else []
         envs.reset(0)
         owned = [os.sched_getaffinity(pid) for pid in pids]
         assert sorted(core for cores_of in owned for core in cores_of) == sorted(cores) or not pids
@@ -118,5 +115,5 @@ def test_a_worker_that_dies_is_reported():
     with pytest.raises(ChildProcessError, match=r"worker process of Reacher-v2 .*-9"):
         with ParallelEnvs("Reacher-v2", 4, 2) as envs:
             envs.reset(0)
-            os.kill(envs.workers[1]._env.processes[0].pid, signal.SIGKILL)
-            run.rollout(envs, lambda t, rows, obs, goal: np.zeros((2, 2)), 3)
+            os.kill(envs.halves[0]._env.processes[1].pid, signal.SIGKILL)
+            run.rollout(envs, lambda t, which, obs, goal: np.zeros((4, 2)), 3)

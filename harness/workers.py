@@ -8,15 +8,14 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from multiprocessing import connection
 from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from harness import numerics
 from harness.border import KEYS, Border
 from harness.errors import UsageError
 from harness.tasks import PAPER_ENVS, make_env
@@ -86,7 +85,8 @@ class EnvGroup(gym.Env):
     def reset(self, *, seed=None, options=None):
         seeds = [None if seed is None else seed + i for i in range(len(self.envs))]
         pairs = zip(self.envs, seeds, strict=True)
-        return self._stack([env.reset(seed=s)[0] for env, s in pairs]), {}
+        obs = self._stack([env.reset(seed=s)[0] for env, s in pairs])
+        return obs, {"is_success": np.zeros(len(self.envs), bool)}
 
     def step(self, action):
         stepped = [env.step(a) for env, a in zip(self.envs, action, strict=True)]
@@ -101,119 +101,154 @@ class EnvGroup(gym.Env):
         return {k: np.stack([obs[k] for obs in observations]) for k in KEYS}
 
 
-class Worker:
-    """The environments `which` of all, in a process of their own, or in this one without `main`."""
+class Here(SyncVectorEnv):
+    """An AsyncVectorEnv without processes, whose answers are there when they are asked for."""
 
-    def __init__(self, name: str, make: MakeEnv, which: slice, main: int | None, core: int | None):
-        self.name, self.which = name, which
-        group = partial(EnvGroup, make, which.stop - which.start, main, core)
-        vector = AsyncVectorEnv if main else SyncVectorEnv
+    processes = ()
+
+    def reset_async(self, seed=None):
+        self._answer = self.reset(seed=seed)
+
+    def step_async(self, action):
+        self._answer = self.step(action)
+
+    def reset_wait(self):
+        return self._answer
+
+    step_wait = reset_wait
+
+
+class Half:
+    """The environments `which` of all, shared by some processes, one for each of `cores`. `reset`
+    and `step` begin, `wait` waits for the answer, so that the other half can act meanwhile."""
+
+    def __init__(self, name: str, make: MakeEnv, which: slice, cores: list, here: bool):
+        self.name, self.which, self.size = name, which, (which.stop - which.start) // len(cores)
+        main = None if here else os.getpid()
+        groups = [partial(EnvGroup, make, self.size, main, core) for core in cores]
+        vector = Here if here else AsyncVectorEnv
         try:
-            self._env = vector([group], copy=False, autoreset_mode=AutoresetMode.DISABLED)
+            self._env = vector(groups, copy=False, autoreset_mode=AutoresetMode.DISABLED)
         except (EOFError, ConnectionError) as error:
             raise UsageError(f"a worker process of {name} could not be started") from error
 
-    def reset(self, seed: int | None = None) -> dict[str, np.ndarray]:
+    def reset(self, seed: int | None = None) -> None:
         """Start an episode in each. With a seed, environment i of all is seeded with seed + i;
-        without, it goes on with the random numbers it has. Returns float32 arrays of (n, ...)."""
-        seed = None if seed is None else [seed + self.which.start]
-        return self._copies(self._ask(self._env.reset, seed=seed)[0])
+        without, it goes on with the random numbers it has."""
+        first = range(self.which.start, self.which.stop, self.size)
+        seeds = None if seed is None else [seed + i for i in first]
+        self._answer = self._env.reset_wait
+        self._ask(self._env.reset_async, seed=seeds)
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """One step in each: actions (n, A) in [-1, 1] -> observations, is_success (n,)."""
-        obs, *_, info = self._ask(self._env.step, action[None])
-        return self._copies(obs), info["is_success"][0]
+    def step(self, action: np.ndarray) -> None:
+        """One step in each: actions (n, A) in [-1, 1]."""
+        self._answer = self._env.step_wait
+        self._ask(self._env.step_async, action.reshape(-1, self.size, action.shape[-1]))
+
+    def wait(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Observations, float32 arrays of (n, ...) that hold until the next step, and is_success
+        (n,), False after `reset`."""
+        obs, *_, info = self._ask(self._answer)
+        obs = {name: x.reshape(-1, x.shape[-1]) for name, x in obs.items()}
+        return obs, info["is_success"].reshape(-1)
 
     def close(self, now: bool) -> None:
-        """now: without waiting for a step that may be under way."""
-        if now and self._processes():
-            # gymnasium would first read the step's answer, and the thread that waits for it has
-            # perhaps read half of it
-            for process in self._processes():
+        """now: without waiting for a step that may be under way, of whose answer a part may have
+        been read already."""
+        try:
+            for process in self._env.processes if now else ():
                 process.terminate()
                 process.join()
-            self._env.closed = True
-            return
-        try:
-            self._env.close()
+            if not now or not self._env.processes:
+                self._env.close()
         except (EOFError, ConnectionError):  # the process is dead, so there is nothing to close
-            self._env.closed = True
-
-    def _processes(self):
-        return getattr(self._env, "processes", [])
-
-    def _copies(self, obs):
-        return {name: x[0].copy() for name, x in obs.items()}
+            pass
+        self._env.closed = True
 
     def _ask(self, method, *args, **kwargs):
-        """Call it, and if the process is found dead say how it ended."""
+        """Call it, and if a process is found dead say how it ended."""
         try:
             return method(*args, **kwargs)
         except (EOFError, ConnectionError) as error:
-            (process,) = self._processes()
-            process.join(timeout=1)
+            ended = connection.wait([p.sentinel for p in self._env.processes], timeout=1)
+            dead = [p for p in self._env.processes if p.sentinel in ended]
+            for process in dead:
+                process.join()
+            codes = ", ".join(str(process.exitcode) for process in dead)
             raise ChildProcessError(
-                f"a worker process of {self.name} died (exit code {process.exitcode})"
+                f"a worker process of {self.name} died (exit code {codes})"
             ) from error
 
 
 class ParallelEnvs:
     """num_envs environments of `make_env(name, **settings)` in num_workers processes, the same
-    number in each; use it in a `with`. With one worker there is no other process."""
+    number in each; use it in a `with`. With one worker there is no other process.
 
-    def __init__(self, name: str, num_envs: int, num_workers: int, **settings):
+    in_halves: the workers are two halves (an even number of workers), which take turns: while the
+    environments of one step, the networks act for the other.
+    """
+
+    def __init__(
+        self, name: str, num_envs: int, num_workers: int, in_halves: bool = False, **settings
+    ):
         self.num_envs, self.num_workers = num_envs, num_workers
-        size, rest = divmod(num_envs, num_workers)
-        if rest:
+        if num_envs % num_workers:
             raise ValueError(f"{num_workers} workers cannot share {num_envs} environments evenly")
         # Left alone, the scheduler wakes workers on the same core while another idles: with a core
         # each, a step of 16 FetchReach takes a fifth less. Fewer workers than cores may share the
         # machine with other runs, and stay free.
         cores = available_cores()
         pin = 1 < num_workers == len(cores) and hasattr(os, "sched_setaffinity")
-        self._pool = ThreadPoolExecutor(num_workers, initializer=numerics.begin_thread)
+        cores = cores if pin else [None] * num_workers
         # gymnasium would print the traceback of what a worker raises; it is raised here as well.
         self._logged, gym.logger.min_level = gym.logger.min_level, 50
         # A process that is not forked does not know what the user's own script has registered.
         spec = gym.registry.get(PAPER_ENVS.get(name, name).rpartition(":")[2])
-        self.workers = [
-            Worker(
+        make = partial(make_env, name, spec=spec, **settings)
+        n = 2 if in_halves else 1
+        envs, workers = num_envs // n, num_workers // n
+        self.halves = [
+            Half(
                 name,
-                partial(make_env, name, spec=spec, **settings),
-                slice(i * size, (i + 1) * size),
-                main=os.getpid() if num_workers > 1 else None,
-                core=cores[i] if pin else None,
+                make,
+                slice(i * envs, (i + 1) * envs),
+                cores[i * workers : (i + 1) * workers],
+                here=num_workers == 1,
             )
-            for i in range(num_workers)
+            for i in range(n)
         ]
 
-    def each(self, function: Callable[[Worker], object]) -> list:
-        """function(worker) for all workers at the same time, each in a thread of its own, so that
-        none waits for another: while one acts, the other steps. Returns the results in order."""
-        if self.num_workers == 1:
-            return [function(self.workers[0])]
-        return list(self._pool.map(function, self.workers))
+    def empty_episodes(self, horizon: int) -> dict[str, np.ndarray]:
+        """Room for an episode of each environment: the arrays of her.EpisodeBuffer."""
+        vector = self.halves[0]._env
+        sizes = {key: box.shape[-1] for key, box in vector.single_observation_space.items()}
+        shapes = {
+            "obs": (horizon + 1, sizes["observation"]),
+            "achieved_goal": (horizon + 1, sizes["achieved_goal"]),
+            "desired_goal": (sizes["desired_goal"],),
+            "action": (horizon, vector.single_action_space.shape[-1]),
+        }
+        return {name: np.empty((self.num_envs, *s), np.float32) for name, s in shapes.items()}
 
     def reset(self, seed: int) -> None:
         """Seed environment i with seed + i."""
-        self.each(lambda worker: worker.reset(seed))
+        for half in self.halves:
+            half.reset(seed)
+        for half in self.halves:
+            half.wait()
 
     def __enter__(self):
         return self
 
     def __exit__(self, kind, *_):
         # After an error a worker may be in the middle of a step, or gone.
-        for worker in self.workers:
-            worker.close(now=kind is not None)
-        self._pool.shutdown()  # a thread whose environment hung ends with the process
+        for half in self.halves:
+            half.close(now=kind is not None)
         gym.logger.min_level = self._logged
 
 
-def whole_heads(num_workers: int | None, num_envs: int, heads: int) -> int:
-    """How many workers to take of at most num_workers (None: one a core, and 4 at most), so that
-    each has as many environments, those of whole heads or of a part of one."""
-    # The main process acts for one worker at a time, so that many wait for it (results/SPEED.md).
-    most = min(num_workers or min(len(available_cores()), 4), num_envs)
-    return max(
-        w for w in range(1, most + 1) if num_envs % w == 0 and (heads % w == 0 or w % heads == 0)
-    )
+def number_of_workers(asked: int | None, num_envs: int) -> int:
+    """As many as were asked for or, with None, as there are cores; fewer where the environments
+    cannot be shared evenly."""
+    most = min(asked or len(available_cores()), num_envs)
+    return max(w for w in range(1, most + 1) if num_envs % w == 0)
