@@ -9,15 +9,17 @@ import random
 import re
 import resource
 import shutil
-import subprocess
 import sys
 import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.vector import AsyncVectorEnv
 
 from ensemble import EnsembleDDPG
 from harness import assemble, records
@@ -25,66 +27,23 @@ from harness.border import remark
 from harness.errors import EnvironmentFailed, UsageError
 from harness.settings import Config, complete
 from harness.tasks import examine, make_env
-from harness.testing import HERE, SMALL, Line, finish, main, start, without_timing
+from harness.testing import SMALL, Line, main, without_timing
 from harness.workers import ParallelEnvs
 from run import train
 
-FLOAT32 = np.finfo(np.float32)
+ANY = np.finfo(np.float32)
+NO_SERVER = RuntimeError("no\nserver.")
 
 
-def odd(name, length=10, **changes):
-    gym.register(f"{name}-v0", type(name, (Line,), changes), max_episode_steps=length)
-    return f"{name}-v0"
+def odd(length=10, **changes):
+    """The name of a `Line` with these methods and attributes in place of its own."""
+    name = f"Odd{len(gym.registry)}-v0"
+    gym.register(name, type("Odd", (Line,), changes), max_episode_steps=length)
+    return name
 
 
-def stepped(change):
-    """A `step` whose five results `change` makes others of."""
-    return lambda self, action: change(self, *Line.step(self, action))
-
-
-def observing(**others):
-    """An `observe` in which these are functions of what it would be."""
-
-    def observe(self):
-        obs = Line.observe(self)
-        return {**obs, **{key: change(obs[key]) for key, change in others.items()}}
-
-    return observe
-
-
-def later(change):
-    """`change`, but not while the episodes are looked at: from a process's step 150 on."""
-    count = [0]
-
-    def step(self, action):
-        count[0] += 1
-        result = Line.step(self, action)
-        return change(self, *result) if count[0] > 150 else result
-
-    return step
-
-
-def in_place(self, achieved_goal, desired_goal, info):
-    """Takes for its own what float32 goals are not copied into."""
-    apart = np.asarray(desired_goal, np.float32)
-    apart -= np.asarray(achieved_goal, np.float32)
-    return -1.0 * (np.abs(apart)[..., 0] > self.tolerance)
-
-
-def drawn_globally(self, *, seed=None, options=None):
-    Line.reset(self, seed=seed)
-    self.x, self.g = np.random.uniform(-1, 1, 1), np.array([random.uniform(-1, 1)])  # noqa: NPY002
-    return self.observe(), {}
-
-
-def shrinks_without_seed(self, *, seed=None, options=None):
-    self.tolerance *= 1 if seed is not None else 0.3
-    return Line.reset(self, seed=seed)
-
-
-def changes_folder(self, render_mode=None):
-    Line.__init__(self)
-    os.chdir(tempfile.gettempdir())
+def spaces(**others):
+    return Dict({**Line.observation_space, **others})
 
 
 def raising(error):
@@ -94,202 +53,160 @@ def raising(error):
     return method
 
 
-def reset_as(change):
-    def reset(self, *, seed=None, options=None):
-        return change(self, *Line.reset(self, seed=seed))
-
-    return reset
+def seeing(change, key="observation"):
+    """An `observe` in which this key is `change` of the environment."""
+    return lambda self: {**Line.observe(self), key: change(self)}
 
 
-def shared(self):
-    """Observations in the same arrays each time, which later steps overwrite."""
-    if not hasattr(self, "arrays"):
-        self.arrays = {name: x.copy() for name, x in Line.observe(self).items()}
+def aiming(change):
+    return seeing(change, "desired_goal")
+
+
+def saying(success):
+    """A `stepped` whose is_success is this function of the reward."""
+    return lambda s, o, r, a, b, i: (o, r, a, b, {"is_success": success(r)})
+
+
+def in_place(self, achieved_goal, desired_goal, info):
+    """Works in what float32 goals are not copied into."""
+    apart = np.asarray(desired_goal, np.float32)
+    apart -= np.asarray(achieved_goal, np.float32)
+    return -1.0 * (np.abs(apart)[..., 0] > self.tolerance)
+
+
+def overwritten(self):
+    """Observes in the same arrays each time."""
+    self.arrays = getattr(self, "arrays", None) or {k: x + 0 for k, x in Line.observe(self).items()}
     for name, x in Line.observe(self).items():
         self.arrays[name][:] = x
     return self.arrays
 
 
-def without_a_goal(self, render_mode=None):
-    Line.__init__(self)
-    none = gym.spaces.Box(-1, 1, (0,), np.float64)
-    spaces = {**self.observation_space, "achieved_goal": none, "desired_goal": none}
-    self.observation_space = gym.spaces.Dict(spaces)
-
-
 def almost_there(self):
     """Nearer to the goal than float32 can tell."""
-    return {**Line.observe(self), "achieved_goal": self.g + 1e-8}
+    return {**Line.observe(self), "achieved_goal": self.g + 1e-9}
 
 
-def to_a_billionth(self, achieved_goal, desired_goal, info):
-    return -1.0 * (np.abs(achieved_goal - desired_goal)[..., 0] > 1e-9)
+def moves_the_action(self, action):
+    result = Line.step(self, action)
+    action.fill(9)
+    return result
 
 
-ends = (False, False)  # neither terminated nor truncated
+def drawn_globally(self, *, seed=None, options=None):
+    Line.reset(self, seed=seed)
+    self.x, self.g = np.random.uniform(-1, 1, 1), np.array([random.uniform(-1, 1)])  # noqa: NPY002
+    return self.observe(), {}
 
 
-def saying(success):
-    """A `step` whose is_success is a function of the reward."""
-    return stepped(lambda s, o, r, *_: (o, r, *ends, {"is_success": success(r)}))
+def changes_folder(self, render_mode=None):
+    os.chdir(tempfile.gettempdir())
 
 
-def seeing(change):
-    """A `step` whose observations have other entries."""
-    return stepped(lambda s, o, *more: ({**o, **change(s)}, *more))
+class Nearer(gym.Wrapper):
+    """A wrapper with a reward of its own, reached within 0.3, and no word on success."""
+
+    def step(self, action):
+        obs, *_ = self.env.step(action)
+        return obs, self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {}), 0, 0, {}
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -1.0 * (np.abs(achieved_goal - desired_goal)[..., 0] > 0.3)
 
 
-def rewarding(change):
-    """A `step` with another reward."""
-    return stepped(lambda s, o, r, *more: (o, change(r), *more))
+gym.register("Nearer-v0", lambda: Nearer(Line()), max_episode_steps=10)
 
+PLAIN, DRAWN = odd(), odd(reset=drawn_globally)
 
-def computing(change):
-    """A `compute_reward` that makes something else of its rewards."""
-    return lambda self, a, d, i: change(self, Line.compute_reward(self, a, d, i))
-
-
-LEARNED = {
-    odd("Plain"): "",
-    odd("InPlace", compute_reward=in_place): "",
-    odd("DrawnGlobally", reset=drawn_globally): "",
-    odd("ChangesFolder", __init__=changes_folder): "",
-    odd("CloseRaises", close=raising(RuntimeError("no server"))): "its close raised RuntimeError",
-    odd("CloseExits", close=raising(SystemExit(3))): "its close raised SystemExit: 3",
-    odd("MovesTheAction", step=lambda self, a: (Line.step(self, a), a.fill(9))[0]): "",
-    odd("SuccessIsAnArray", step=saying(lambda r: np.array([r == 0]))): "",
-    odd("SuccessIsANumber", step=saying(lambda r: 1.0 + r)): "",
-    odd("RewardIsAnArray", step=rewarding(lambda r: np.array(r))): "",
-    odd("RewardsAreWhole", compute_reward=computing(lambda s, r: np.int8(r))): "",
-    odd("RewardsAreBools", best=1.0, compute_reward=computing(lambda s, r: r == 1)): "",
-    odd("ListsForArrays", observe=observing(observation=list)): "",
-    odd(
-        "FarObservations", observe=observing(observation=lambda x: 1000 + 500 * x)
-    ): "number 0 of its observation moves only beyond ±200",
-    odd(
-        "CloseObservations", observe=observing(observation=lambda x: x / 1000)
-    ): "number 0 of its observation moves by less than 0.01",
-    odd("SharesItsArrays", observe=shared, reset=reset_as(lambda s, o, i: (shared(s), i))): "",
-}
-
-REFUSED = {  # before anything is written
-    odd(
-        "Shrinks",
-        tolerance=0.5,
-        reset=reset_as(
-            lambda s, *both: (setattr(s, "tolerance", max(0.05, s.tolerance * 0.9)), both)[1]
-        ),
-    ): "gives -1",
-    odd(
-        "ReadsTheStep", compute_reward=computing(lambda s, r: 0 * r if s.t == 5 else r)
-    ): "compute_reward of what it observed",
-    odd(
-        "WholeActions", action_space=gym.spaces.Box(0, 10, (1,), np.int64)
-    ): "its actions are whole numbers",
-    odd(
-        "WideActions", action_space=gym.spaces.Box(FLOAT32.min, FLOAT32.max, (1,))
-    ): "too far apart",
-    odd("NoActions", action_space=gym.spaces.Box(-1, 1, (0,))): "not a flat Box",
-    odd("NoSpaces", __init__=lambda s, render_mode=None: None): "its spaces raised AttributeError",
-    odd("SuccessIsNone", step=saying(lambda r: None)): "is_success of step 1 is None",
-    odd("SuccessIsText", step=saying(lambda r: "no")): "is_success of step 1 is 'no'",
-    odd("SuccessIsNaN", step=saying(lambda r: np.nan)): "is_success of step 1 is nan",
-    odd(
-        "InfoIsNone", step=stepped(lambda s, o, r, a, b, i: (o, r, a, b, None))
-    ): "its step raised AttributeError",
-    odd(
-        "FourResults", step=stepped(lambda s, o, r, a, b, i: (o, r, a, i))
-    ): "its step raised ValueError: not enough values",
-    odd(
-        "ResetIsOld", reset=reset_as(lambda s, o, i: o)
-    ): "its reset raised ValueError: too many values",
-    odd("ResetTakesNoSeed", reset=lambda s: Line.reset(s)): "its reset raised TypeError",
-    odd(
-        "Grows", step=seeing(lambda s: {"observation": np.zeros(2)})
-    ): r"its observation is \(2,\) after step 1",
-    odd(
-        "GoalGrows", step=seeing(lambda s: {"desired_goal": np.zeros((1, 1))})
-    ): r"its desired_goal is \(1, 1\) after step 1",
-    odd(
-        "LosesAKey", step=stepped(lambda s, o, *more: ({"observation": s.x}, *more))
-    ): "its step raised KeyError: 'achieved_goal'",
-    odd(
-        "ObservesNone", observe=observing(observation=lambda x: None)
-    ): r"its observation is \(\) after step 0",
-    odd(
-        "ObservesText", observe=observing(observation=lambda x: ["far"])
-    ): "its reset raised ValueError: could not convert",
-    odd(
-        "ObservesNaN", observe=observing(observation=lambda x: x * np.nan)
-    ): "NaN or Inf in its observation after step 0",
-    odd(
-        "ObservesTooMuch", observe=observing(observation=lambda x: x * 1e300)
-    ): "NaN or Inf in its observation after step 0",
-    odd("RewardIsNone", step=rewarding(lambda r: None)): "its step raised TypeError",
-    odd("RewardIsHalf", step=rewarding(lambda r: r / 2)): "step . gave the reward -0.5",
-    odd("RewardIsNaN", step=rewarding(lambda r: np.nan)): "step 1 gave the reward nan",
-    odd(
-        "RewardsTwice", compute_reward=computing(lambda s, r: np.stack([r, r], -1).squeeze())
-    ): "is not vectorised",
-    odd("RewardsNone", compute_reward=lambda s, a, d, i: [None] * len(a)): "but nan for a goal",
-    odd(
-        "RewardsText", compute_reward=lambda s, a, d, i: ["near"] * len(a)
-    ): r"no info \(ValueError",
-    odd("RewardsRagged", compute_reward=lambda s, a, d, i: [[0], [], 0]): r"no info \(ValueError",
-    odd("NoGoal", __init__=without_a_goal): "are not all flat Boxes",
-    odd("TimeRaises", dt=property(raising(RuntimeError("no clock")))): "its dt raised RuntimeError",
-    odd("GivesThree", compute_reward=computing(lambda s, r: r[:3] if np.ndim(r) else r)): (
-        r"its compute_reward of \(10, 1\) goals gave \(3,\) rewards"
+LEARNED = [  # what is said of an environment, and another in which the same is learned
+    ("", odd(compute_reward=in_place), PLAIN),
+    ("", odd(observe=overwritten), PLAIN),
+    ("", odd(step=moves_the_action), PLAIN),
+    ("", odd(best=1.0), PLAIN),
+    ("", odd(best=1.0, rewarded=lambda s, r: r == 1), PLAIN),
+    ("", odd(rewarded=lambda s, r: np.int8(r)), PLAIN),
+    ("", odd(stepped=lambda s, o, r, *more: (o, np.array(r), *more)), PLAIN),
+    ("", odd(stepped=lambda s, o, r, a, b, i: (o, r, a, b, {})), PLAIN),
+    ("", odd(stepped=lambda s, o, r, a, b, i: (o, r, r == 0, s.t == 10, i)), PLAIN),
+    ("", odd(stepped=saying(lambda r: 1.0 + r)), PLAIN),
+    ("", odd(stepped=saying(lambda r: np.array([r == 0]))), PLAIN),
+    ("", odd(observe=seeing(lambda s: [*s.x])), PLAIN),
+    ("", odd(observe=seeing(lambda s: None, "image")), PLAIN),
+    ("", "Nearer-v0", odd(tolerance=0.3)),
+    ("", DRAWN, DRAWN),
+    ("its close raised RuntimeError: no server", odd(close=raising(NO_SERVER)), PLAIN),
+    ("its close raised SystemExit: 3", odd(close=raising(SystemExit(3))), PLAIN),
+    ("0 of its observation moves only beyond ±200", odd(observe=seeing(lambda s: 999 + s.x)), None),
+    (
+        "0 of its observation moves by less than 0.01",
+        odd(observe=seeing(lambda s: s.x / 999)),
+        None,
     ),
-    odd("TooFine", observe=almost_there, compute_reward=to_a_billionth): (
-        "step 1 gave the reward -1, and compute_reward of what it observed gives 0"
+]
+
+REFUSED = [  # before anything is written
+    ("its constructor raised RuntimeError: no server$", odd(__init__=raising(NO_SERVER))),
+    ("its spaces raised RuntimeError", odd(action_space=property(raising(NO_SERVER)))),
+    ("it has no goals", odd(observation_space=Line.space)),
+    ("it has no goals", odd(observation_space=Dict(observation=Line.space))),
+    ("are not all flat Boxes", odd(observation_space=spaces(observation=Discrete(3)))),
+    ("are not all flat Boxes", odd(observation_space=spaces(observation=Box(-1, 1, (2, 2))))),
+    ("are not all flat Boxes", odd(observation_space=spaces(observation=Box(-1, 1, (0,))))),
+    ("_goal differ in size", odd(observation_space=spaces(achieved_goal=Box(-2, 2, (2,))))),
+    ("not a flat Box", odd(action_space=Discrete(3))),
+    ("not a flat Box", odd(action_space=Box(-1, 1, (0,)))),
+    ("not a flat Box", odd(action_space=Box(-1, 1, (2, 2)))),
+    ("its actions are whole numbers", odd(action_space=Box(0, 10, (1,), np.int64))),
+    ("its actions have no bounds", odd(action_space=Box(-np.inf, 1, (1,)))),
+    ("its actions have no width", odd(action_space=Box(np.float32([0, 1]), np.float32([1, 1])))),
+    ("too far apart", odd(action_space=Box(ANY.min, ANY.max, (1,)))),
+    ("give one, such as --episode-length 50", odd(length=None)),
+    ("it has no compute_reward", odd(compute_reward=None)),
+    ("it has no compute_reward", odd(compute_reward=property(raising(AttributeError())))),
+    (r"no info \(KeyError: 'x'\)", odd(compute_reward=lambda s, a, d, i: i["x"])),
+    (r"no info \(ValueError", odd(compute_reward=lambda s, a, d, i: ["near"] * len(a))),
+    (r"3 pairs of goals gave \(3, 2\)", odd(rewarded=lambda s, r: np.stack([r, r], -1))),
+    (r"3 pairs of goals gave \(\)", odd(rewarded=lambda s, r: r.mean())),
+    ("but nan for a goal", odd(compute_reward=lambda s, a, d, i: [None] * len(a))),
+    ("not the -1 and 0", odd(compute_reward=lambda s, a, d, i: -np.abs(a - d)[..., 0])),
+    ("not the -1 and 0", odd(rewarded=lambda s, r: 5 + r)),
+    ("its dt raised RuntimeError", odd(dt=property(raising(NO_SERVER)))),
+    ("its reset raised TypeError", odd(reset=lambda s: Line.reset(s))),
+    ("its step raised ValueError: not enough", odd(stepped=lambda s, o, r, a, b, i: (o, r, a, i))),
+    ("its step raised SystemExit$", odd(step=raising(SystemExit()))),
+    (r"is \(\) after step 0, its space says \(1,\)", odd(observe=seeing(lambda s: None))),
+    (r"goal is \(1, 1\) after step 1", odd(observe=aiming(lambda s: np.ones((1,) * (1 + s.t))))),
+    ("NaN or Inf in its observation after step 0", odd(observe=seeing(lambda s: s.x * np.nan))),
+    ("NaN or Inf in its observation after step 0", odd(observe=seeing(lambda s: s.x * 1e300))),
+    ("NaN or Inf in its desired_goal after step 0", odd(observe=aiming(lambda s: s.g * np.inf))),
+    ("is_success of step 1 is None, not", odd(stepped=saying(lambda r: None))),
+    ("is_success of step 1 is nan, not", odd(stepped=saying(lambda r: np.nan))),
+    ("step 1 gave the reward -0.5", odd(stepped=lambda s, o, r, *more: (o, -0.5, *more))),
+    ("step 1 gave the reward nan", odd(stepped=lambda s, o, r, *more: (o, np.nan, *more))),
+    ("its goal moved in step 3;", odd(observe=aiming(lambda s: s.g + s.t // 3))),
+    ("in step 1 of 10 without success", odd(stepped=lambda s, o, r, a, b, i: (o, r, r < 0, b, i))),
+    ("try --episode-length 5", odd(stepped=lambda s, o, r, a, b, i: (o, r, a, s.t == 5, i))),
+    (r"\(10, 1\) goals gave \(3,\)", odd(rewarded=lambda s, r: r[:3] if r.ndim else r)),
+    ("its compute_reward gave 1", odd(rewarded=lambda s, r: r + 2 * (np.size(r) > 9))),
+    (
+        "its compute_reward gave nan",
+        odd(rewarded=lambda s, r: r * (1 if np.size(r) < 9 else np.nan)),
     ),
-    odd(
-        "ForgetsTheAxis",
-        compute_reward=lambda s, a, d, i: -1.0 * (np.linalg.norm(a - d) > s.tolerance),
-    ): "is not vectorised",
-    odd("CloseGoals", unit=0.001): "its goals differ by 0.000. at most",
-    odd("FarGoals", unit=1000): r"its goals lie beyond ±200 \(number 0\)",
-    odd("ExitsInStep", step=raising(SystemExit())): "its step raised SystemExit",
-    odd("ExitsInReset", reset=raising(SystemExit(0))): "its reset raised SystemExit: 0",
-    odd(
-        "ExitsAtOnce", __init__=raising(SystemExit("bye"))
-    ): "cannot make .* its constructor raised SystemExit: bye",
-    odd("ExitsInReward", compute_reward=raising(SystemExit())): r"no info \(SystemExit\)",
-    odd("StopsIteration", step=raising(StopIteration())): "its step raised StopIteration",
-    odd("OutOfMemory", step=raising(MemoryError())): "its step raised MemoryError",
-    odd("Asserts", step=raising(AssertionError())): "its step raised AssertionError",
-    odd("Lasting", 10**9): "--buffer-size must be 1000000000 or more",
-}
+    (
+        "needs a compute_reward of",
+        odd(tolerance=9, stepped=lambda s, o, r, *more: (o, -1.0, *more)),
+    ),
+    ("reward -1, and .* gives 0", odd(tolerance=0.5, rewarded=lambda s, r: r * (s.resets < 6))),
+    ("reward -1, .* gives 0", odd(tolerance=0, observe=almost_there)),
+    ("its goals differ by 0.000. at most", odd(unit=0.001)),
+    (r"its goals lie beyond ±200 \(number 0\)", odd(unit=1000)),
+    ("--buffer-size must be 1000000000 or more", odd(length=10**9)),  # and not played
+]
 
-STOPPED = {  # once training has begun
-    odd("ShrinksLater", tolerance=3.0, reset=shrinks_without_seed): "compute_reward of what it",
-    odd("ExitsLater", step=later(raising(SystemExit()))): "its step raised SystemExit",
-    odd(
-        "NaNLater", step=later(lambda s, o, *more: ({**o, "achieved_goal": s.x * np.nan}, *more))
-    ): "NaN or Inf in its achieved_goal",
-    odd(
-        "GrowsLater", step=later(lambda s, o, *more: ({**o, "observation": np.zeros(2)}, *more))
-    ): "its observation is",
-    odd("RewardLater", step=later(lambda s, o, r, *more: (o, 1.0, *more))): "gave the reward 1$",
-    odd(
-        "OtherRewardLater", step=later(lambda s, o, r, *more: (o, -1.0 - r, *more))
-    ): "compute_reward of what it observed gives",
-    odd(
-        "SuccessLater", step=later(lambda s, o, r, *_: (o, r, 0, 0, {"is_success": None}))
-    ): "is_success of step . is None",
-    odd(
-        "MovesLater", step=later(lambda s, o, *more: ({**o, "desired_goal": -s.g}, *more))
-    ): "its goal moved in step",
-    odd(
-        "CutLater", step=later(lambda s, o, r, a, b, i: (o, r, a, True, i))
-    ): "cut an episode off after",
-}
-
-
-def arguments(env, folder, workers=1):
-    some = {**SMALL, "env": env, "num_workers": workers, "out": folder, "epochs": 1}
-    return [f"--{name.replace('_', '-')}={value}" for name, value in some.items()]
+STOPPED = [  # once training has begun, most episodes of which have no seeds
+    ("ended in step 1 of", odd(stepped=lambda s, o, r, a, b, i: (o, r, not s.seeded, b, {}))),
+    ("raised SystemExit: 3", odd(rewarded=lambda s, r: r if s.seeded or r.ndim else sys.exit(3))),
+]
 
 
 @pytest.fixture(autouse=True)
@@ -299,106 +216,138 @@ def as_before(monkeypatch):
     remark.cache_clear()
 
 
-@pytest.mark.parametrize("env", LEARNED)
-def test_what_makes_no_difference_or_one_line(env, tmp_path, capfd, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    if env != "DrawnGlobally-v0":
-        plain = {**SMALL, "env": "Plain-v0", "epochs": 1, "out": str(tmp_path / "plain")}
-        assert 0 < train(Config(**plain))[0]["train_success_rate"] < 1
-    main(arguments(env, "run"))
-    err = capfd.readouterr().err.splitlines()
-    assert len(err) == bool(LEARNED[env]) and LEARNED[env] in "".join(err)
-    ours = without_timing(tmp_path / "run")
-    if env not in ("DrawnGlobally-v0", "FarObservations-v0", "CloseObservations-v0"):
-        assert ours == without_timing(tmp_path / "plain")
+def arguments(env, folder, workers=1):
+    some = {**SMALL, "env": env, "num_workers": workers, "out": folder, "epochs": 1}
+    return [f"--{name.replace('_', '-')}={value}" for name, value in some.items()]
 
 
-@pytest.mark.parametrize("env", REFUSED)
-def test_what_is_refused_before_anything_is_written(env, tmp_path, capfd):
-    with pytest.raises(UsageError, match=REFUSED[env]):
-        examine(env, fits=lambda task: assemble.refuse_what_does_not_fit(complete(Config()), task))
+def ended(capfd, *argv):
+    """How the command line ends: the exit code, what is on stdout and on stderr."""
+    capfd.readouterr()
     with pytest.raises(SystemExit) as stop:
-        main(arguments(env, tmp_path / "run"))
-    assert stop.value.code == 2 and capfd.readouterr().err.count("\n") == 1
+        main(argv)
+    return stop.value.code, *capfd.readouterr()
+
+
+def played(env):
+    """All that `Border` hands out in two episodes, as it is afterwards, and the rewards again."""
+    env, seen, results = make_env(env), [], []
+    for seed in (0, 4):
+        seen.append(env.reset(seed=seed)[0])
+        for _ in range(10):
+            action = np.sign(seen[-1]["desired_goal"] - seen[-1]["achieved_goal"]) / 2
+            given = action.copy()
+            obs, reward, *_, info = env.step(action)
+            assert action == given and type(info["is_success"]) is bool
+            seen.append(obs)
+            results.append((reward, info["is_success"]))
+    rows = {key: np.array([obs[key] for obs in seen]) for key in seen[0]}
+    assert all(x.dtype == np.float32 for x in rows.values()) and len(set(results)) == 2
+    return results, env.compute_reward(rows["achieved_goal"], rows["desired_goal"]), rows
+
+
+@pytest.mark.parametrize(("line", "env", "like"), LEARNED)
+def test_what_makes_no_difference_or_one_line(line, env, like, capfd):
+    if like:
+        np.testing.assert_equal(played(env), played(like))
+    for _ in range(2):
+        examine(env).env.close()
+    err = capfd.readouterr().err
+    assert err.count("\n") == bool(line) and line in err and env in (err or env)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_environment_with_all_of_these_trains_as_one_without(
+    workers, tmp_path, capfd, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    changes = {"observe": seeing(lambda s: None, "image"), "__init__": changes_folder}
+    changes["stepped"] = lambda s, o, r, *more: (o, r, r == 1, s.t == 10, {})
+    env = odd(best=1.0, close=raising(NO_SERVER), **changes)
+    main(arguments(PLAIN, "plain", workers))
+    main(arguments(env, "run", workers))
+    said = f"run.py: {env}: its close raised RuntimeError: no server"  # by each process once
+    assert {*capfd.readouterr().err.splitlines()} == {said}
+    (row,) = without_timing(tmp_path / "plain")
+    assert 0 < row["train_success_rate"] < 1 and row["env_steps"] == 3 * 16 * 10
+    assert without_timing(tmp_path / "run") == [row]
+
+
+@pytest.mark.parametrize(("message", "env"), REFUSED)
+def test_what_is_refused(message, env):
+    fits = partial(assemble.refuse_what_does_not_fit, complete(Config()))
+    with pytest.raises(UsageError, match=message) as error:
+        examine(env, fits=fits)
+    assert "\n" not in str(error.value) and "EnvironmentFailed" not in str(error.value)
+
+
+@pytest.mark.parametrize(("message", "env"), [REFUSED[0], *REFUSED[-2:]])
+def test_what_is_refused_is_refused_before_anything_is_written(message, env, tmp_path, capfd):
+    code, _, err = ended(capfd, *arguments(env, tmp_path / "run"))
+    assert code == 2 and err.count("\n") == 1 and re.search(message, err)
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("env", STOPPED)
-def test_what_only_comes_later_stops_the_run(env, tmp_path, capfd):
-    with pytest.raises(SystemExit) as stop:
-        main(arguments(env, tmp_path / "run", workers=2))
-    (line,) = capfd.readouterr().err.splitlines()
-    assert stop.value.code == 1 and line.startswith(f"run.py: stopped in epoch 1: {env}: ")
-    assert re.search(STOPPED[env], line), line
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize(("message", "env"), STOPPED)
+def test_what_only_comes_later_stops_the_run(workers, message, env, tmp_path, capfd):
+    code, _, err = ended(capfd, *arguments(env, tmp_path / "run", workers))
+    assert code == 1 and err.startswith(f"run.py: stopped in epoch 1: {env}: ")
+    assert err.count("\n") == 1 and re.search(message, err), err
 
 
 @pytest.mark.parametrize(
-    ("name", "render", "message"),
+    ("message", "render"),
     [
-        ("DrawsNone", lambda self: None, "no picture .* but <class 'NoneType'>"),
-        ("DrawsFloats", lambda self: np.zeros((9, 9, 3)), "no picture .* float64"),
-        ("DrawsAList", lambda self: [np.zeros((9, 9, 3), np.uint8)], "no picture .* 'list'"),
-        ("DrawsNothing", lambda self: np.zeros((0, 0, 3), np.uint8), "no picture"),
-        ("DrawsGrey", lambda self: np.zeros((9, 9), np.uint8), "no picture"),
-        ("DrawsNot", None, "its render raised NotImplementedError"),
-        ("DrawsALot", raising(SystemExit()), "its render raised SystemExit"),
+        ("no picture .* but <class 'NoneType'>", lambda self: None),
+        ("no picture .* 'list'", lambda self: [np.zeros((9, 9, 3), np.uint8)]),
+        ("no picture .* float64", lambda self: np.zeros((9, 9, 3))),
+        ("no picture", lambda self: np.zeros((0, 0, 3), np.uint8)),
+        ("no picture", lambda self: np.zeros((9, 9), np.uint8)),
+        ("no picture", lambda self: np.zeros((9, 9, 4), np.uint8)),
+        ("its render raised NotImplementedError", Line.render),
     ],
 )
-def test_pictures_that_are_none_are_refused_before_anything_is_played(
-    name, render, message, tmp_path, capfd, monkeypatch
-):
+def test_pictures_that_are_none_are_refused(message, render):
+    with pytest.raises(EnvironmentFailed, match=message):
+        make_env(odd(render=render)).render()
+
+
+def test_what_cannot_be_drawn_is_refused_before_anything_is_played(tmp_path, capfd, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setenv("MUJOCO_GL", "as it was")
-    env = odd(name, **({"render": render} if render else {}))
-    main(arguments(env, tmp_path / "run"))
-    capfd.readouterr()
-    with pytest.raises(SystemExit) as stop:
-        main([f"--play={tmp_path / 'run'}", f"--gif={tmp_path / 'a.gif'}"])
-    out, err = capfd.readouterr()
-    assert stop.value.code == 2 and out == "" and err.count("\n") == 1
-    assert re.search(f"cannot draw {env} .*{message}", err), err
-    assert not (tmp_path / "a.gif").exists() and os.environ["MUJOCO_GL"] == "as it was"
+    main(arguments(PLAIN, tmp_path / "run"))
+    picture = tmp_path / "a.gif"
+    code, out, err = ended(capfd, f"--play={tmp_path / 'run'}", f"--gif={picture}")
+    assert code == 2 and out == "" and err.count("\n") == 1 and f"cannot draw {PLAIN} (" in err
+    assert not picture.exists() and os.environ["MUJOCO_GL"] == "as it was"
 
 
-def test_a_reward_that_is_not_given_again_shows_in_the_last_step_and_after_a_reset():
-    still = np.zeros(1, np.float32)
-    for when in ("step", "reset"):
-        env = make_env("Plain-v0")
-        env.reset(seed=0)
-        for _ in range(9 if when == "step" else 3):
-            assert env.step(still)[1] == -1
-        env.unwrapped.tolerance = 9
-        with pytest.raises(EnvironmentFailed, match=r"step 1 gave the reward -1, .* gives 0 \("):
-            env.step(still) if when == "step" else env.reset()
-
-
-def test_the_environments_own_word_says_what_succeeded():
-    env = make_env(odd("SaysYes", step=saying(lambda r: True)))
-    env.reset(seed=0)
-    _, reward, *_, info = env.step(np.zeros(1, np.float32))
-    assert reward == -1 and info["is_success"] is True
-
-
-def test_pictures_are_copies():
+def test_pictures_are_copies_and_a_window_gives_none():
     canvas = np.zeros((9, 9, 3), np.uint8)
-    env = make_env(odd("DrawsInPlace", render=lambda self: canvas), render_mode="rgb_array")
+    env = make_env(odd(render=lambda self: canvas))
     first = env.render()
     canvas[:] = 255
     assert not first.any() and env.render().all()
+    assert make_env(odd(render=lambda self: None), render_mode="human").render() is None
 
 
-@pytest.mark.parametrize(("low", "high"), [(-0.7, 0.3), (0.1, 0.7), (-1e-3, 3e7)])
-def test_no_action_leaves_the_bounds_by_rounding(low, high):
-    box = gym.spaces.Box(low, high, (1,), np.float64)
-
-    def step(self, action):
-        assert box.contains(np.float64(action)), action
-        return Line.step(self, 0 * action)
-
-    env = make_env(odd(f"Bounds{low}".replace(".", ""), action_space=box, step=step))
+@pytest.mark.parametrize("when", ["step", "reset"])
+def test_a_reward_that_is_not_given_again_shows_in_the_last_step_and_after_a_reset(when):
+    env, still = make_env(PLAIN), np.zeros(1, np.float32)
     env.reset(seed=0)
-    for action in (-1, 1, 0.3):
-        env.step(np.float32([action]))
+    for _ in range(9 if when == "step" else 3):
+        assert env.step(still)[1] == -1
+    env.unwrapped.tolerance = 9
+    with pytest.raises(EnvironmentFailed, match=r"step 1 gave the reward -1, .* gives 0 \("):
+        env.step(still) if when == "step" else env.reset()
+
+
+def test_the_environments_own_word_says_what_succeeded():
+    env = make_env(odd(tolerance=0, stepped=saying(lambda r: True)))
+    env.reset(seed=0)
+    _, reward, *_, info = env.step(np.zeros(1, np.float32))
+    assert reward == -1 and info["is_success"] is True
 
 
 def test_what_cannot_be_made_in_a_worker_is_said_before_anything_is_written(tmp_path, capfd):
@@ -406,84 +355,105 @@ def test_what_cannot_be_made_in_a_worker_is_said_before_anything_is_written(tmp_
     main_process = os.getpid()
 
     def init(self, render_mode=None):
-        Line.__init__(self)
         if os.getpid() != main_process:
             raise OSError("the port is taken")
 
-    env = odd("OneOfAKind", __init__=init)
-    with pytest.raises(SystemExit) as stop:
-        main(arguments(env, tmp_path / "run", workers=2))
-    err = capfd.readouterr().err
-    assert stop.value.code == 2 and "could not be started" in err and "Traceback" not in err
+    code, _, err = ended(capfd, *arguments(odd(__init__=init), tmp_path / "run", workers=2))
+    assert code == 2 and "could not be started" in err and "Traceback" not in err
     assert "the port is taken" in err and not (tmp_path / "run").exists()
 
 
-def test_global_generators_follow_the_seed_in_each_process(tmp_path):
-    """Two workers draw other goals, the same in each run; in tests too."""
-    for name in ("a", "b"):
-        main(arguments("DrawnGlobally-v0", tmp_path / name, workers=2))
-    assert without_timing(tmp_path / "a") == without_timing(tmp_path / "b")
-    with ParallelEnvs("DrawnGlobally-v0", 8, 2) as envs:
-        envs.reset(2**32 - 3)  # beyond what NumPy takes
-        envs.halves[0].reset()
-        goals = envs.halves[0].wait()[0]["desired_goal"]
-    assert len(np.unique(goals)) == 8
+@pytest.mark.parametrize(("low", "high"), [(-0.7, 0.3), (0.1, 0.7), (-1e-3, 3e7)])
+def test_actions_are_rescaled_to_the_bounds_and_do_not_leave_them_by_rounding(low, high):
+    box, taken = Box(np.array([low, -5]), np.array([high, 5]), dtype=np.float64), []
+
+    def step(self, action):
+        taken.append(action)
+        return Line.step(self, 0 * action[:1])
+
+    env = make_env(odd(action_space=box, step=step))
+    env.reset(seed=0)
+    for action in ([-1, -1], [0.3, 0], [1, 1]):
+        env.step(np.float32(action))
+        assert box.contains(np.float64(taken[-1]))
+    part = (np.array(taken) - [low, -5]) / [high - low, 10]
+    np.testing.assert_allclose(part, [[0, 0], [0.65, 0.5], [1, 1]], atol=1e-6)
 
 
-def test_an_environment_that_ignores_its_seed_is_said_to():
-    def fresh(self, obs, info):
-        self.x = np.random.default_rng().uniform(-1, 1, 1)
-        return self.observe(), info
-
-    def trembling(self, obs, *more):
-        return {**obs, "observation": obs["observation"] + np.random.default_rng().normal()}, *more
-
-    for env in (
-        odd("IgnoresItsSeed", reset=reset_as(fresh)),
-        odd("Trembles", step=stepped(trembling)),
+def test_what_is_said_of_an_environment():
+    trembles = odd(observe=seeing(lambda s: s.x + np.random.default_rng().normal() * (s.t == 10)))
+    for env, more in (
+        (PLAIN, ""),
+        (DRAWN, ""),
+        (odd(best=1.0), "; its rewards of 0 and 1 count as -1 and 0"),
+        (trembles, "; it does not follow its seed, so that runs differ"),
     ):
-        assert "it does not follow its seed" in examine(env).made
-    assert "seed" not in examine("Plain-v0").made + examine("DrawnGlobally-v0").made
+        assert examine(env).made == f"{env}: 10 steps an episode{more}"
 
 
-def test_the_papers_tasks_are_not_remarked_on(capfd):
-    for name in ("FetchPush-v1", "FetchPush-v4", "FetchSilce-v1"):
-        examine(name)
-    assert capfd.readouterr().err == ""
+@pytest.mark.parametrize(("tolerance", "episodes"), [(0, 8 + 1), (9, 1 + 1)])
+def test_as_many_episodes_are_examined_as_it_takes_to_reach_a_goal(tolerance, episodes):
+    """And the first one again, to see whether it follows its seed."""
+    steps = []
+
+    def step(self, action):
+        steps.append(action)
+        return Line.step(self, action)
+
+    examine(odd(tolerance=tolerance, step=step))
+    assert len(steps) == episodes * 10
 
 
-def test_every_environment_of_a_run_is_closed(tmp_path):
+def test_what_a_script_registers_is_known_to_processes_that_are_not_forked(monkeypatch):
+    def elsewhere(name, **settings):
+        gym.registry.pop(name)
+        return make_env(name, **settings)
+
+    monkeypatch.setattr("harness.workers.make_env", elsewhere)
+    with ParallelEnvs(odd(), 1, 1) as envs:
+        envs.reset(0)
+
+
+@pytest.mark.slow
+def test_workers_can_be_spawned(monkeypatch):
+    monkeypatch.setattr("harness.workers.AsyncVectorEnv", partial(AsyncVectorEnv, context="spawn"))
+    with ParallelEnvs(odd(), 2, 2) as envs:
+        envs.reset(0)
+
+
+def test_global_generators_follow_the_seed_in_each_process():
+    """Two workers draw other numbers, the same each time."""
+    drawn = []
+    for _ in range(2):
+        with ParallelEnvs(DRAWN, 8, 2) as envs:
+            envs.reset(2**32 - 3)  # beyond what NumPy takes
+            envs.halves[0].reset()
+            drawn.append(envs.halves[0].wait()[0])
+    np.testing.assert_equal(*drawn)
+    for key in ("observation", "desired_goal"):
+        assert len(np.unique(drawn[0][key])) == 8
+
+
+def test_every_environment_is_closed(tmp_path):
     opened, closed = [], []
-
-    def init(self, render_mode=None):
-        Line.__init__(self)
-        opened.append(self)
-
-    env = odd("Counted", __init__=init, close=lambda self: closed.append(self))
-    train(Config(**{**SMALL, "env": env}, epochs=1, out=str(tmp_path / "run")))
+    changes = {"__init__": lambda s, **_: opened.append(s), "close": lambda s: closed.append(s)}
+    small = Config(**{**SMALL, "env": odd(**changes)}, epochs=1, out=str(tmp_path / "run"))
+    train(small)
     assert len(opened) == 17 and {*map(id, opened)} == {*map(id, closed)}
+    with pytest.raises(UsageError):
+        examine(odd(**changes, step=raising(NO_SERVER)))
+    assert len(opened) == 18 and closed[-1] is opened[-1]
 
 
 def test_a_grown_observation_is_not_taken_for_a_damaged_checkpoint(tmp_path, capfd):
-    env = odd("Changes")
+    env = odd()
     main(arguments(env, tmp_path / "run"))
-
-    class Grown(Line):
-        def __init__(self, render_mode=None):
-            super().__init__()
-            box = gym.spaces.Box(-2, 2, (2,), np.float64)
-            self.observation_space = gym.spaces.Dict({**self.observation_space, "observation": box})
-
-        observe = observing(observation=lambda x: np.append(x, 0))
-
-    gym.registry.pop(env)
-    gym.register(env, Grown, max_episode_steps=10)
-    capfd.readouterr()
+    grown = spaces(observation=Box(-2, 2, (2,)))
+    other = odd(observation_space=grown, observe=seeing(lambda s: np.append(s.x, 0)))
+    gym.registry[env] = replace(gym.registry[other], id=env)
     for option in ("--resume", "--play"):
-        with pytest.raises(SystemExit) as stop:
-            main([f"{option}={tmp_path / 'run'}"])
-        err = capfd.readouterr().err
-        assert stop.value.code == 2 and "of other sizes" in err and "damaged" not in err
+        code, _, err = ended(capfd, f"{option}={tmp_path / 'run'}")
+        assert code == 2 and "of other sizes" in err and "damaged" not in err
 
 
 def test_where_rows_are_there_and_no_checkpoint_that_is_said(whole, tmp_path):
@@ -493,67 +463,28 @@ def test_where_rows_are_there_and_no_checkpoint_that_is_said(whole, tmp_path):
         assemble.restored(folder)
 
 
-SPAWNED = """
-import multiprocessing, sys
-import gymnasium, run
-from harness.testing import SMALL, Line
-class Mine(Line):
-    pass
-if __name__ == "__main__":
-    gymnasium.register("Mine-v0", Mine, max_episode_steps=10)
-    multiprocessing.set_start_method("spawn")
-    small = {**SMALL, "env": "Mine-v0", "num_workers": 2, "epochs": 1}
-    print(len(run.train(run.Config(**small, out=sys.argv[1]))))
-"""
-
-
-def test_what_a_script_registers_is_known_to_processes_that_are_spawned(tmp_path):
-    (tmp_path / "script.py").write_text(SPAWNED)
-    code, out, err = finish(start(tmp_path / "run", script=tmp_path / "script.py"))
-    assert code == 0 and out.splitlines()[-1] == "1", err
-
-
-def test_a_module_that_is_called_like_one_of_the_projects_is_named(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "her.py").write_text("import gymnasium\n")
-    with pytest.raises(UsageError, match=rf"the module is {HERE / 'her.py'}: if that is not yours"):
-        make_env("her:Mine-v0")
-
-
-def test_a_renderer_that_is_not_there_is_one_line():
-    environment = {**os.environ, "MUJOCO_GL": "no such renderer"}
-    done = subprocess.run(
-        [sys.executable, HERE / "run.py", "--help"], env=environment, capture_output=True, text=True
-    )
-    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "MUJOCO_GL" in done.stderr
-
-
 def test_memory_is_what_the_process_may_have(monkeypatch):
-    there = assemble.memory()
-    used, limits = 4096 * int(Path("/proc/self/statm").read_text().split()[0]), resource.getrlimit
-    allowed = used + 2**30
-    monkeypatch.setattr(
-        resource,
-        "getrlimit",
-        lambda kind: (allowed, -1) if kind == resource.RLIMIT_AS else limits(kind),
-    )
+    there, limits = assemble.memory(), resource.getrlimit
+    allowed = 4096 * int(Path("/proc/self/statm").read_text().split()[0]) + 2**30
+    lowered = lambda kind: (allowed, -1) if kind == resource.RLIMIT_AS else limits(kind)  # noqa: E731
+    monkeypatch.setattr(resource, "getrlimit", lowered)
     assert abs(assemble.memory() - min(2**30, there)) < 2**26
-    task = examine("Plain-v0")
-    needed = [
-        assemble.memory_needed(complete(Config()), replace(task, horizon=steps))
-        for steps in (10, 1010)
-    ]
-    assert needed[1] - needed[0] == 2 * 16 * 1000 * 4 * 3  # two collections by 16 environments
+
+
+def test_what_does_not_fit_into_the_memory_is_refused():
+    task, config = examine(PLAIN), complete(Config())
+    less, more = (assemble.memory_needed(config, replace(task, horizon=t)) for t in (10, 1010))
+    assert more - less == 2 * 16 * 1000 * 4 * 3  # two collections by 16 environments
     with pytest.raises(UsageError, match=r"GB are needed .* lower --heads, --batch-size"):
-        assemble.refuse_what_does_not_fit(complete(Config(buffer_size=10**9)), task)
+        assemble.refuse_what_does_not_fit(complete(Config(buffer_size=10**13)), task)
 
 
-def test_memory_that_runs_out_stops_the_run_in_one_line(tmp_path, monkeypatch, capfd):
-    for error in (
-        MemoryError("no room"),
-        RuntimeError("alloc_cpu: can't allocate memory: 9 bytes"),
-    ):
-        monkeypatch.setattr(EnsembleDDPG, "update_targets", raising(error))
-        with pytest.raises(SystemExit) as stop:
-            main(arguments("Plain-v0", tmp_path / type(error).__name__))
-        assert stop.value.code == 1 and capfd.readouterr().err.count("\n") == 1
+@pytest.mark.parametrize(
+    "error", [MemoryError("no room"), RuntimeError("can't allocate memory: 9")]
+)
+def test_memory_that_runs_out_stops_the_run_in_one_line(error, tmp_path, monkeypatch, capfd):
+    with pytest.raises(UsageError, match="the run cannot be set up: MemoryError: no room"):
+        examine(PLAIN, fits=raising(MemoryError("no room")))
+    monkeypatch.setattr(EnsembleDDPG, "update_targets", raising(error))
+    code, _, err = ended(capfd, *arguments(PLAIN, tmp_path / "run"))
+    assert code == 1 and err.count("\n") == 1

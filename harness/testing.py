@@ -13,7 +13,6 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-import envs_point
 from ensemble import EnsembleDDPG
 from harness import cli, settings
 from harness.records import TIMING_COLUMNS, read_checkpoint, read_rows
@@ -23,8 +22,10 @@ HERE = Path(__file__).parent.parent
 # Two wait for each other, for most of the time where cores are shared.
 torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
 
-
 SMALL_TRAINING = {"epochs": 1, "cycles": 2, "updates": 2, "batch_size": 32, "eval_episodes": 16}
+SMALL = {"env": "PointMassEmptyEnv-v1", "cycles": 2, "updates": 2, "batch_size": 16}
+SMALL |= {"heads": 2, "eval_episodes": 16, "num_workers": 1}
+ARGUMENTS = [f"{settings.flag(k)}={v}" for k, v in SMALL.items()]
 
 
 def assert_frequencies(counts, probabilities):
@@ -54,76 +55,50 @@ def exact_reward(achieved, desired):
     return np.where((achieved == desired).all(axis=-1), 0.0, -1.0)
 
 
+@torch.no_grad()
 def random_agent(num_heads=16, seed=0, obs_dim=5, goal_dim=3, action_dim=2, **kwargs):
     """An agent with biases other than 0, targets unlike the networks, and statistics."""
-    agent = EnsembleDDPG(
-        obs_dim, goal_dim, action_dim, gamma=0.9, num_heads=num_heads, seed=seed, **kwargs
-    )
+    sizes = (obs_dim, goal_dim, action_dim)
+    agent = EnsembleDDPG(*sizes, gamma=0.9, num_heads=num_heads, seed=seed, **kwargs)
     generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for net in (agent.actor, agent.critic, agent.target_actor, agent.target_critic):
-            for p in (*net.trunk, *net.stacks):
-                p.add_(0.05 * torch.randn(p.shape, generator=generator))
+    for net in (agent.actor, agent.critic, agent.target_actor, agent.target_critic):
+        for p in (*net.trunk, *net.stacks):
+            p.add_(0.05 * torch.randn(p.shape, generator=generator))
     rng = np.random.default_rng(seed)
     agent.normalizer.update(rng.normal(1, 2, (500, obs_dim + goal_dim)))
     return agent
 
 
-class Tracker(gym.Env):
-    """A goal environment from outside this project: 3 numbers, 1 of them the goal, 2 actions with
-    bounds of their own, 7 steps an episode."""
-
-    observation_space = envs_point.goal_space(3, 1)
-    action_space = gym.spaces.Box(np.float32([0, -5]), np.float32([10, 5]))
-
-    def compute_reward(self, achieved_goal, desired_goal, info):
-        return envs_point.sparse_reward(achieved_goal, desired_goal, 0.5)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x, self.goal = self.np_random.uniform(-2, 2, (2, 1))
-        self.last = np.zeros(2)
-        return self._observe(), {}
-
-    def step(self, action):
-        assert self.action_space.contains(np.float32(action)), action
-        self.last, self.x = action, self.x + 0.1 * (action[0] - 5) + 0.1 * action[1]
-        obs = self._observe()
-        reward = self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {})
-        return obs, float(reward), False, False, {}
-
-    def _observe(self):
-        observation = np.concatenate([self.x, self.last])
-        return {
-            "observation": observation,
-            "achieved_goal": self.x.copy(),
-            "desired_goal": self.goal.copy(),
-        }
-
-
 class Line(gym.Env):
-    """A point on a line, with nothing wrong: many tests change one thing each."""
+    """A point on a line, with nothing wrong. A test overrides one of these methods or attributes:
+    what is observed, how rewards come out, what `step` returns. In training, only the episodes
+    that an epoch begins with are seeded."""
 
-    tolerance, best, unit = 0.1, 0.0, 1  # the unit of what is observed
+    tolerance, best, unit, resets = 0.1, 0.0, 1, 0  # the unit of what is observed
+    space = gym.spaces.Box(-2, 2, (1,), np.float64)
+    observation_space = gym.spaces.Dict(observation=space, achieved_goal=space, desired_goal=space)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
 
     def __init__(self, render_mode=None):
-        box = gym.spaces.Box(-2 * self.unit, 2 * self.unit, (1,), np.float64)
-        self.observation_space = gym.spaces.Dict(
-            observation=box, achieved_goal=box, desired_goal=box
-        )
-
-    def compute_reward(self, achieved_goal, desired_goal, info):
-        far = np.abs(achieved_goal - desired_goal)[..., 0] > self.tolerance * self.unit
-        return self.best - far.astype(np.float32)
+        self.render_mode = render_mode
 
     def observe(self):
         x, g = self.unit * self.x, self.unit * self.g
         return {"observation": x, "achieved_goal": x, "desired_goal": g}
 
+    def rewarded(self, rewards):
+        return rewards
+
+    def stepped(self, obs, reward, terminated, truncated, info):
+        return obs, reward, terminated, truncated, info
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        far = np.abs(achieved_goal - desired_goal)[..., 0] > self.tolerance * self.unit
+        return self.rewarded(self.best - far.astype(np.float32))
+
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.t = 0
+        self.t, self.resets, self.seeded = 0, self.resets + 1, seed is not None
         self.x, self.g = self.np_random.uniform(-1, 1, (2, 1))
         return self.observe(), {}
 
@@ -131,42 +106,28 @@ class Line(gym.Env):
         self.t += 1
         self.x = np.clip(self.x + 0.2 * action, -1, 1)
         obs = self.observe()
-        reward = float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {}))
-        return obs, reward, False, False, {"is_success": reward == self.best}
+        reward = self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {})
+        return self.stepped(obs, reward, False, False, {"is_success": bool(reward == self.best)})
 
 
-class Broken(envs_point.PointMass):
-    """Gives a NaN at step 7 of an episode without a seed of its own, as those are that train."""
+class Broken(Line):
+    """Observes NaN in step 7, but not in an episode that begins with a seed."""
 
-    def reset(self, *, seed=None, options=None):
-        self.left = 7 if seed is None else -1
-        return super().reset(seed=seed, options=options)
-
-    def step(self, action):
-        self.left -= 1
-        obs, *rest = super().step(action)
-        if self.left == 0:
-            obs["observation"][1] = math.nan
-        return obs, *rest
+    def observe(self):
+        nan = math.nan if self.t == 7 and not self.seeded else 0
+        return {**super().observe(), "observation": self.x + nan}
 
 
-class BrokenReward(envs_point.PointMass):
-    """Gives a NaN for goals far to the right, but not in an episode with a seed of its own."""
+class BrokenReward(Line):
+    """Computes NaN for the steps of such an episode when they are all asked for again."""
 
-    def compute_reward(self, achieved_goal, desired_goal, info):
-        reward = super().compute_reward(achieved_goal, desired_goal, info)
-        return np.where(self.late & (np.asarray(achieved_goal)[..., 0] > 0.54), np.nan, reward)
-
-    def reset(self, *, seed=None, options=None):
-        self.late = seed is None
-        super().reset(seed=seed)
-        self._xy = self._goal = (0.3, 0.0)
-        return self._observe(), {}
+    def rewarded(self, rewards):
+        return rewards + (math.nan if rewards.ndim and self.t and not self.seeded else 0)
 
 
-gym.register("Tracker-v0", Tracker, max_episode_steps=7)
+Tracker = Line  # the name that experiments/test_experiments.py has for it
 gym.register("Broken-v0", Broken, max_episode_steps=10)
-gym.register("BrokenReward-v0", BrokenReward, max_episode_steps=50)
+gym.register("BrokenReward-v0", BrokenReward, max_episode_steps=10)
 
 
 def without_timing(folder):
@@ -174,21 +135,24 @@ def without_timing(folder):
     return [{k: v for k, v in row.items() if k not in TIMING_COLUMNS} for row in rows]
 
 
-SMALL = {
-    "env": "PointMassEmptyEnv-v1",
-    "cycles": 2,
-    "updates": 2,
-    "batch_size": 16,
-    "heads": 2,
-    "eval_episodes": 16,
-    "num_workers": 1,
-}
+def assert_same_run(a, b):
+    """The same rows and the same learned state, timing aside."""
+
+    def leaves(state):
+        if isinstance(state, dict):
+            return leaves([*state.values()])
+        if isinstance(state, (list, tuple)):
+            return [leaf for part in state for leaf in leaves(part)]
+        return [state]
+
+    assert without_timing(a) == without_timing(b)
+    first, second = (leaves(read_checkpoint(f / "checkpoint.pt")["parts"]) for f in (a, b))
+    assert len(first) == len(second) > 100
+    for x, y in zip(first, second, strict=True):
+        assert torch.equal(x, y) if isinstance(x, torch.Tensor) else x == y
 
 
-ARGUMENTS = [f"{settings.flag(k)}={v}" for k, v in SMALL.items()]
-
-
-def start(*arguments, program=None, module=None, script=None, limit=None, cwd=None):
+def start(*arguments, program=None, module=None, script=HERE / "run.py", limit=None, cwd=None):
     """run.py (or a program's text, a module or a script) in a process and session of its own,
     which Ctrl-C reaches even if these tests run in the background; with a limit on the size of the
     files it may write; in this folder or another."""
@@ -198,15 +162,9 @@ def start(*arguments, program=None, module=None, script=None, limit=None, cwd=No
         if limit:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    what = (
-        ["-c", program]
-        if program
-        else ["-m", module]
-        if module
-        else [str(script or HERE / "run.py")]
-    )
+    what = ["-c", program] if program else ["-m", module] if module else [script]
     return subprocess.Popen(
-        [sys.executable, *what, *map(str, arguments)],
+        [sys.executable, *map(str, [*what, *arguments])],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -230,35 +188,9 @@ def finish(process):
     return process.returncode, out, err
 
 
-def tensors(state):
-    """All tensors and numbers of a checkpoint, in order."""
-    if isinstance(state, dict):
-        state = list(state.values())
-    if isinstance(state, (list, tuple)):
-        return [t for part in state for t in tensors(part)]
-    return [state]
-
-
-def assert_same_run(a, b):
-    """The same rows and the same learned state, timing aside."""
-    rows = [
-        [{k: v for k, v in row.items() if k not in TIMING_COLUMNS} for row in read_rows(folder)]
-        for folder in (a, b)
-    ]
-    assert rows[0] == rows[1]
-    first, second = (
-        tensors(read_checkpoint(folder / "checkpoint.pt")["parts"]) for folder in (a, b)
-    )
-    assert len(first) == len(second) > 100
-    for x, y in zip(first, second, strict=True):
-        assert torch.equal(x, y) if isinstance(x, torch.Tensor) else x == y
-
-
 def command(*arguments, cwd):
     """The command line, in a process of its own: exit code, stdout, stderr."""
-    program = [sys.executable, str(HERE / "run.py"), *arguments]
-    done = subprocess.run(program, capture_output=True, text=True, cwd=cwd)
-    return done.returncode, done.stdout, done.stderr
+    return finish(start(*arguments, cwd=cwd))
 
 
 def main(argv):
