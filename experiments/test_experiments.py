@@ -22,7 +22,7 @@ from harness.errors import UsageError
 from harness.records import COLUMNS, as_tensors, epochs_done, read_checkpoint
 from harness.settings import METHODS, Config
 from harness.tasks import PAPER_ENVS, examine
-from harness.testing import Tracker, finish, start, wait_for_an_epoch, without_timing
+from harness.testing import Line, finish, start, wait_for_an_epoch, without_timing
 from her import EpisodeBuffer
 from run import train
 from vcp import value_consistency_priority
@@ -525,7 +525,7 @@ def test_a_run_that_another_process_begins_meanwhile_is_left_to_it(tmp_path, cap
 
 
 def test_environments_are_checked_with_the_settings_of_the_runs(tmp_path):
-    gym.register("Lengthless-v0", Tracker)
+    gym.register("Lengthless-v0", Line)
     runs = [
         sweep.all_runs(["Lengthless-v0"], [variant], [0], {}, tmp_path)
         for variant in ("episode_length=7", "")

@@ -1,22 +1,33 @@
 """What the tests share: small runs, environments with one thing changed, a run in a process."""
 
+import copy
+import itertools
 import math
 import os
 import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections import Counter, defaultdict
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import torch
 
-from ensemble import EnsembleDDPG
-from harness import cli, settings
+import run
+from ensemble import EnsembleDDPG, Normalizer
+from harness import assemble, cli, settings
 from harness.records import TIMING_COLUMNS, read_checkpoint, read_rows
-from run import train
+from her import EpisodeBuffer
+from run import Config, train
+from vcp import HERBuffer
 
 HERE = Path(__file__).parent.parent
 # Two wait for each other, for most of the time where cores are shared.
@@ -55,6 +66,31 @@ def exact_reward(achieved, desired):
     return np.where((achieved == desired).all(axis=-1), 0.0, -1.0)
 
 
+def assert_drawn_as_in_her(batch, n, horizon, ratio):
+    """Of n `numbered_episodes` all steps are drawn alike, with the goal of a later step, all alike,
+    or, with a probability of 1 - ratio, with the goal of the episode; and `assert_whole`."""
+    expected = {}
+    for e, t in itertools.product(range(n), range(horizon)):
+        expected[e, t, -1 - e, -1 - e] = (1 - ratio) / (n * horizon)
+        for later in range(t + 1, horizon + 1):
+            expected[e, t, e, later] = ratio / (horizon - t) / (n * horizon)
+    step = batch["obs"] / 10
+    counts = Counter(map(tuple, np.hstack([step, batch["goal"]]).astype(int).tolist()))
+    assert counts.keys() <= expected.keys()
+    assert_frequencies([counts[key] for key in expected], [*expected.values()])
+    assert_whole(batch)
+
+
+def assert_whole(batch):
+    """What belongs to a transition of `numbered_episodes` is of the same episode and step, and the
+    reward is 0 where the goal is the NEXT achieved goal."""
+    np.testing.assert_array_equal(batch["action"], -batch["obs"] / 10)
+    np.testing.assert_array_equal(batch["next_obs"] - batch["obs"], [[0, 10]] * len(batch["obs"]))
+    np.testing.assert_array_equal(batch["hindsight"], batch["goal"][:, 0] >= 0)
+    reached = (batch["next_obs"] == 10 * batch["goal"]).all(axis=1)
+    np.testing.assert_array_equal(batch["reward"], reached - 1.0)
+
+
 @torch.no_grad()
 def random_agent(num_heads=16, seed=0, obs_dim=5, goal_dim=3, action_dim=2, **kwargs):
     """An agent with biases other than 0, targets unlike the networks, and statistics."""
@@ -67,6 +103,88 @@ def random_agent(num_heads=16, seed=0, obs_dim=5, goal_dim=3, action_dim=2, **kw
     rng = np.random.default_rng(seed)
     agent.normalizer.update(rng.normal(1, 2, (500, obs_dim + goal_dim)))
     return agent
+
+
+SPIED = {  # none of them a default
+    "env": "PointMassEmptyEnv-v1",
+    "seed": 5,
+    "epochs": 1,
+    "cycles": 3,
+    "updates": 2,
+    "batch_size": 24,
+    "episode_length": 20,
+    "buffer_size": 700,
+    "relabel_ratio": 0.6,
+    "learning_rate": 2e-3,
+    "heads_at_once": 2,
+    "polyak": 0.9,
+    "noise": 0.11,
+    "random_actions": 0.22,
+    "action_penalty": 0.33,
+    "eval_episodes": 40,
+    "heads": 4,
+    "temperature": 3.0,
+    "importance": "inverse",
+    "scored_per_drawn": 1.5,
+    "her_buffer_capacity": 650,
+    "priority": "variance",
+    "acting_head": "one",
+    "num_workers": 1,
+}
+
+SPIES = {
+    "agent": (assemble, "EnsembleDDPG"),
+    "B_o": (assemble, "EpisodeBuffer"),
+    "B_h": (assemble, "HERBuffer"),
+    "explore": (run, "exploration"),
+    "act": (EnsembleDDPG, "act"),
+    "rollout": (run, "rollout"),
+    "to B_o": (EpisodeBuffer, "add"),
+    "relabel": (run, "relabel_future"),
+    "normalise": (Normalizer, "update"),
+    "snapshot": (EnsembleDDPG, "snapshot_q_variance"),
+    "fill B_h": (run, "update_her_buffer"),
+    "score": (run, "score"),
+    "draw": (HERBuffer, "sample"),
+    "update": (EnsembleDDPG, "update_heads"),
+    "to B_h": (HERBuffer, "add"),
+    "priorities": (HERBuffer, "update_priorities"),
+    "targets": (EnsembleDDPG, "update_targets"),
+    "value": (EnsembleDDPG, "value"),
+}
+
+
+@cache
+def spied_run(**changes):
+    """A run with SPIED and these changes: `row`; `calls`, a list for each of SPIES; `order`, the
+    names of those that the main thread has made. Scoring waits until the last head has moved."""
+    calls, order, moved = defaultdict(list), [], threading.Event()
+
+    def spy(key, owner, name):
+        function = getattr(owner, name)
+
+        def noted(*args, **kwargs):
+            agent_then = copy.deepcopy(args[0]) if key == "snapshot" else None
+            if key == "score":
+                assert moved.wait(timeout=60)
+                moved.clear()
+            result = function(*args, **kwargs)
+            if key == "update" and 3 in args[1]:
+                moved.set()
+            thread = threading.current_thread()
+            if thread is threading.main_thread():
+                order.append(key)
+            call = {"args": args, "kwargs": kwargs, "result": result}
+            calls[key].append(SimpleNamespace(**call, thread=thread, agent_then=agent_then))
+            return result
+
+        patch.setattr(owner, name, noted)
+
+    with pytest.MonkeyPatch.context() as patch, TemporaryDirectory() as folder:
+        for key, place in SPIES.items():
+            spy(key, *place)
+        (row,) = train(Config(**{**SPIED, **changes}, out=f"{folder}/run"))
+    return SimpleNamespace(row=row, calls=calls, order=order)
 
 
 class Line(gym.Env):
@@ -125,7 +243,6 @@ class BrokenReward(Line):
         return rewards + (math.nan if rewards.ndim and self.t and not self.seeded else 0)
 
 
-Tracker = Line  # the name that experiments/test_experiments.py has for it
 gym.register("Broken-v0", Broken, max_episode_steps=10)
 gym.register("BrokenReward-v0", BrokenReward, max_episode_steps=10)
 
