@@ -50,7 +50,7 @@ def drawn(parts: Parts, method: str, rng: np.random.Generator) -> dict[str, np.n
     tasks: reward, hindsight and weight, (BATCHES·B,) each."""
     schedule = settings.paper_schedule("FetchPush-v1", method)
     config = settings.complete(
-        Config(parts.config.env, method, heads=parts.config.heads, **schedule)
+        Config(env=parts.config.env, method=method, heads=parts.config.heads, **schedule)
     )
     replay = make_replay(config, parts.task, parts.original_buffer)
     if method == "vcp":
