@@ -25,31 +25,37 @@ def value_consistency_priority(
 
     variance: (N,), σ²_i over the critics; temperature: 𝒯; eps: ε. Returns (N,) float64, which add
     up to 1. FloatingPointError if a variance is NaN or Inf.
+    """
+    variance = np.asarray(variance, dtype=np.float64)
+    if not np.isfinite(variance).all():
+        raise FloatingPointError("NaN or Inf in the variance of the Q-values")
+    return normalised_priority(variance, temperature, eps)
+
+
+def normalised_priority(variance, temperature: float, eps: float = 1e-6):
+    """`value_consistency_priority` without its checks, of float64 in NumPy's or PyTorch's array.
 
     The sum inside Eq. (4) is the same for all i, so normalising cancels it, and any other common
     factor may stand in its place. Here it is the largest term: the ratios lie in (0, 1] and one of
     them is 1, so their powers neither overflow nor all vanish, whatever 𝒯 and N are.
     """
-    variance = np.asarray(variance, dtype=np.float64)
-    if not np.isfinite(variance).all():
-        raise FloatingPointError("NaN or Inf in the variance of the Q-values")
     consistency = variance.max() - variance + eps  # σ²_max - σ²_i + ε
     priority = (consistency / consistency.max()) ** temperature  # p_i = (...)^𝒯
     return priority / priority.sum()  # p_i / Σ p
 
 
-def priority_within_kinds(
-    variance: np.ndarray, hindsight: np.ndarray, temperature: float
-) -> np.ndarray:
+def priority_within_kinds(variance, hindsight, temperature: float):
     """Not in the paper: Eq. (4) among the hindsight of B_h, and again among its originals, each
     kind by its own variances and drawn as often as it stands there. (N,), (N,) bool -> (N,).
 
     Where the variance of originals is far above the rest, Eq. (4) over both kinds together leaves
     them out and is flat among the hindsight (NOTES.md, "Originals and hindsight in one B_h").
     """
-    p = np.empty(len(variance))
-    for kind in filter(np.any, (hindsight, ~hindsight)):
-        p[kind] = kind.mean() * value_consistency_priority(variance[kind], temperature)
+    p = 0 * variance
+    for kind in (hindsight, ~hindsight):
+        if kind.any():
+            share = kind.sum() / len(kind)
+            p[kind] = share * normalised_priority(variance[kind], temperature)
     return p
 
 
@@ -63,9 +69,9 @@ def mean_one_within_kinds(weight: np.ndarray, hindsight: np.ndarray) -> np.ndarr
 
 
 PRIORITIES = {  # of the rows that B_h holds: the method, Section 5.6's two ablations, and ours
-    "consistency": lambda rows, t: value_consistency_priority(rows["variance"], t),
-    "variance": lambda rows, t: value_consistency_priority(-rows["variance"], t),
-    "uniform": lambda rows, t: np.full(len(rows["variance"]), 1 / len(rows["variance"])),
+    "consistency": lambda rows, t: normalised_priority(rows["variance"], t),
+    "variance": lambda rows, t: normalised_priority(-rows["variance"], t),
+    "uniform": lambda rows, t: normalised_priority(rows["variance"], 0),
     "within-kind": lambda rows, t: priority_within_kinds(rows["variance"], rows["hindsight"], t),
 }
 
@@ -85,6 +91,8 @@ class HERBuffer:
     A stored variance is not refreshed: it is as old as the transition's stay in the buffer.
     """
 
+    own = staticmethod(np.asarray)  # how rows are stored: harness/gpu.py has another
+
     def __init__(
         self, capacity: int, temperature: float, priority="consistency", importance="paper"
     ):
@@ -98,20 +106,22 @@ class HERBuffer:
     def add(self, batch: Batch, variance: np.ndarray) -> None:
         """Algorithm 1, line 6: store the mini-batch over the oldest transitions.
         batch: arrays or CPU tensors of B rows each; variance: (B,). ValueError for another shape or
-        for more than the capacity."""
-        batch = {name: np.asarray(x) for name, x in {**batch, "variance": variance}.items()}
+        for more than the capacity, FloatingPointError for a variance that is NaN or Inf."""
+        batch = {name: np.asarray(x) for name, x in batch.items()}
+        batch["variance"] = np.asarray(variance, dtype=np.float64)  # Eq. (4) is in float64
         rows = batch["variance"].shape
         if len(rows) != 1 or any(x.shape[:1] != rows for x in batch.values()):
             raise ValueError(f"the variance is {rows}, one number for each transition is needed")
         if rows[0] > self.capacity:
             raise ValueError(f"{rows[0]} transitions do not fit into {self.capacity}")
+        if not np.isfinite(batch["variance"]).all():
+            raise FloatingPointError("NaN or Inf in the variance of the Q-values")
         if not self.data:
-            self.data = {
-                name: np.empty((self.capacity, *x.shape[1:]), x.dtype) for name, x in batch.items()
-            }
+            empty = {n: np.empty((self.capacity, *x.shape[1:]), x.dtype) for n, x in batch.items()}
+            self.data = {name: self.own(x) for name, x in empty.items()}
         slots = (self._next + np.arange(*rows)) % self.capacity
         for name, x in batch.items():
-            self.data[name][slots] = x
+            self.data[name][slots] = self.own(x)
         self._next = (self._next + rows[0]) % self.capacity
         self.size = min(self.size + rows[0], self.capacity)
         self.probabilities = np.empty(0)  # the older ones no longer hold
@@ -120,7 +130,7 @@ class HERBuffer:
         """Algorithm 1, line 7: Eq. (4) over all of B_h, from the stored variances. O(N)."""
         rows = {name: x[: self.size] for name, x in self.data.items()}
         self.probabilities = self._priority(rows, self.temperature)
-        cumulative = self.probabilities.cumsum()
+        cumulative = self.probabilities.cumsum(0)
         self._cumulative = cumulative / cumulative[-1]
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:

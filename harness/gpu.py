@@ -19,35 +19,6 @@ from her import Batch
 WARM_UP = 3  # passes before one is captured, as many as in PyTorch's documentation of CUDA graphs
 
 
-def priorities(variance: torch.Tensor, temperature: float, eps: float = 1e-6) -> torch.Tensor:
-    """`vcp.value_consistency_priority` of a float64 tensor. It does not look for NaN, which is to
-    wait for the GPU; `HERBufferOnGPU.add` does, where the variance is still on the CPU."""
-    consistency = variance.max() - variance + eps
-    priority = (consistency / consistency.max()) ** temperature
-    return priority / priority.sum()
-
-
-def priorities_within_kinds(
-    variance: torch.Tensor, hindsight: torch.Tensor, temperature: float
-) -> torch.Tensor:
-    """`vcp.priority_within_kinds`, without asking the GPU which kinds there are."""
-    total = torch.zeros_like(variance)
-    for kind in (hindsight, ~hindsight):
-        most = variance.masked_fill(~kind, -torch.inf).max()
-        consistency = most - variance + 1e-6  # of its own kind; -Inf where there is none
-        consistency = torch.where(kind, consistency, 0)
-        ratio = (consistency / consistency.max()) ** temperature
-        share = torch.where(kind, ratio, 0)
-        total += torch.where(kind, kind.double().mean() * share / share.sum(), 0)
-    return total
-
-
-PRIORITIES = {
-    "consistency": lambda rows, t: priorities(rows["variance"], t),
-    "variance": lambda rows, t: priorities(-rows["variance"], t),
-    "uniform": lambda rows, t: torch.full_like(rows["variance"], 1 / len(rows["variance"])),
-    "within-kind": lambda rows, t: priorities_within_kinds(rows["variance"], rows["hindsight"], t),
-}
 IMPORTANCE = {**vcp.IMPORTANCE, "none": torch.ones_like}
 
 
@@ -66,38 +37,13 @@ class HERBufferOnGPU(vcp.HERBuffer):
         device: str,
     ):
         super().__init__(capacity, temperature, priority, importance)
-        self._priority, self._importance = PRIORITIES[priority], IMPORTANCE[importance]
+        self._importance = IMPORTANCE[importance]
         self.at_once, self.device = at_once, device
+        self.own = partial(torch.as_tensor, device=device)
         self._drawn: list[Batch] = []
 
-    def add(self, batch: Batch, variance: np.ndarray) -> None:
-        """As `vcp.HERBuffer.add`; FloatingPointError for a variance that is NaN or Inf."""
-        variance = np.asarray(variance)
-        rows, new = {**batch, "variance": variance}, len(variance)
-        if variance.ndim != 1 or any(len(x) != new for x in rows.values()):
-            raise ValueError(f"the variance is {variance.shape}, one number for each is needed")
-        if new > self.capacity:
-            raise ValueError(f"{new} transitions do not fit into {self.capacity}")
-        if not np.isfinite(variance).all():
-            raise FloatingPointError("NaN or Inf in the variance of the Q-values")
-        rows = {name: torch.as_tensor(x, device=self.device) for name, x in rows.items()}
-        if not self.data:
-            self.data = {
-                name: x.new_empty((self.capacity, *x.shape[1:])) for name, x in rows.items()
-            }
-        slots = (self._next + torch.arange(new, device=self.device)) % self.capacity
-        for name, x in rows.items():
-            self.data[name][slots] = x
-        self._next = (self._next + new) % self.capacity
-        self.size = min(self.size + new, self.capacity)
-        self.probabilities = np.empty(0)  # the older ones no longer hold
-
     def update_priorities(self) -> None:
-        rows = {name: self.data[name][: self.size] for name in ("variance", "hindsight")}
-        rows["variance"] = rows["variance"].double()
-        self.probabilities = self._priority(rows, self.temperature)
-        cumulative = self.probabilities.cumsum(0)
-        self._cumulative = cumulative / cumulative[-1]
+        super().update_priorities()
         self._drawn = []
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
@@ -105,7 +51,7 @@ class HERBufferOnGPU(vcp.HERBuffer):
         if not len(self.probabilities):
             raise ValueError("B_h has no priorities: call update_priorities() after add()")
         if not self._drawn:
-            u = torch.as_tensor(rng.random((self.at_once, batch_size)), device=self.device)
+            u = self.own(rng.random((self.at_once, batch_size)))
             i = torch.searchsorted(self._cumulative, u, right=True)  # (at_once, B)
             batch = {name: x[i] for name, x in self.data.items()}
             batch["hindsight"] = batch["hindsight"].float()
