@@ -54,11 +54,10 @@ class EnvGroup(gym.Env):
     Nothing is reset by itself: episodes have a fixed length, and one that ends with success is
     played on. EnvironmentFailed as in `Border`.
 
-    main: the main process's id, for a group that lives in another; there Ctrl-C is ignored and, if
-    `core` is given, that is the one processor that the process may use.
+    main: the main process's id, for a group that lives in another, which ignores Ctrl-C.
     """
 
-    def __init__(self, make: MakeEnv, size: int, main: int | None = None, core: int | None = None):
+    def __init__(self, make: MakeEnv, size: int, main: int | None = None):
         # AsyncVectorEnv makes one of these in the main process too, to look at its spaces.
         for_its_spaces = os.getpid() == main
         if main and not for_its_spaces:
@@ -66,8 +65,6 @@ class EnvGroup(gym.Env):
             signal.signal(signal.SIGTERM, signal.SIG_DFL)  # whose handler is the main process's
             if hasattr(signal, "SIGHUP"):
                 signal.signal(signal.SIGHUP, signal.SIG_IGN)
-            if core is not None:
-                os.sched_setaffinity(0, {core})
         try:
             self.envs = [read_joints_by_index(make()) for _ in range(1 if for_its_spaces else size)]
         except UsageError as error:  # only this one cannot be made: a port, a licence
@@ -119,13 +116,12 @@ class Here(SyncVectorEnv):
 
 
 class Half:
-    """The environments `which` of all, shared by some processes, one for each of `cores`. `reset`
-    and `step` begin, `wait` waits for the answer, so that the other half can act meanwhile."""
+    """The environments `which` of all, shared evenly by processes or, with `here`, in this one.
+    `reset` and `step` begin, `wait` waits, so that meanwhile the networks act for another half."""
 
-    def __init__(self, name: str, make: MakeEnv, which: slice, cores: list, here: bool):
-        self.name, self.which, self.size = name, which, (which.stop - which.start) // len(cores)
-        main = None if here else os.getpid()
-        groups = [partial(EnvGroup, make, self.size, main, core) for core in cores]
+    def __init__(self, name: str, make: MakeEnv, which: slice, num_workers: int, here: bool):
+        self.name, self.which, self.size = name, which, (which.stop - which.start) // num_workers
+        groups = [partial(EnvGroup, make, self.size, None if here else os.getpid())] * num_workers
         vector = Here if here else AsyncVectorEnv
         try:
             self._env = vector(groups, copy=False, autoreset_mode=AutoresetMode.DISABLED)
@@ -194,12 +190,6 @@ class ParallelEnvs:
         self.num_envs, self.num_workers = num_envs, num_workers
         if num_envs % num_workers:
             raise ValueError(f"{num_workers} workers cannot share {num_envs} environments evenly")
-        # Left alone, the scheduler wakes workers on the same core while another idles: with a core
-        # each, a step of 16 FetchReach takes a fifth less. Fewer workers than cores may share the
-        # machine with other runs, and stay free.
-        cores = available_cores()
-        pin = 1 < num_workers == len(cores) and hasattr(os, "sched_setaffinity")
-        cores = cores if pin else [None] * num_workers
         # gymnasium would print the traceback of what a worker raises; it is raised here as well.
         self._logged, gym.logger.min_level = gym.logger.min_level, 50
         # A process that is not forked does not know what the user's own script has registered.
@@ -208,13 +198,7 @@ class ParallelEnvs:
         n = 2 if in_halves else 1
         envs, workers = num_envs // n, num_workers // n
         self.halves = [
-            Half(
-                name,
-                make,
-                slice(i * envs, (i + 1) * envs),
-                cores[i * workers : (i + 1) * workers],
-                here=num_workers == 1,
-            )
+            Half(name, make, slice(i * envs, (i + 1) * envs), workers, here=num_workers == 1)
             for i in range(n)
         ]
 
