@@ -226,8 +226,12 @@ class ParallelEnvs:
 
     def __exit__(self, kind, *_):
         # After an error a worker may be in the middle of a step, or gone.
+        self.close(now=kind is not None)
+
+    def close(self, now: bool = False) -> None:
+        """End the environments and their processes; now: in whatever step they are."""
         for half in self.halves:
-            half.close(now=kind is not None)
+            half.close(now)
         gym.logger.min_level = self._logged
 
 
