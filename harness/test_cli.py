@@ -95,7 +95,8 @@ def test_a_nan_stops_the_run_and_says_where(tmp_path, monkeypatch):
 
 LIMITS = {
     "must be 1 or more": "--epochs 0 --cycles 0 --updates -1 --batch-size 0 --eval-episodes 0"
-    " --heads 0 --num-workers 0 --threads 0 --heads-at-once 0 --her-buffer-capacity 0 --episode-length 0",
+    " --heads 0 --num-workers 0 --threads 0 --heads-at-once 0 --her-buffer-capacity 0"
+    " --episode-length 0",
     "must be 0 or more": "--seed -1 --relabel-ratio -0.1 --noise -1 --action-penalty -1"
     " --temperature -1 --polyak -1 --random-actions -1",
     "must be 1 or less": "--relabel-ratio 80 --polyak 1.5 --random-actions 2",
