@@ -11,7 +11,7 @@ import pytest
 from harness.testing import HERE
 
 CORE = {"run", "vcp", "her", "ensemble", "envs_point"}
-ROOMS = ("harness", "baselines", "experiments")
+ROOMS = ("harness", "baselines", "experiments", "examples")
 # What each may import: modules of the core by their names, rooms by theirs.
 ARROWS = {
     "run": {"vcp", "her", "ensemble", "harness"},
@@ -22,6 +22,7 @@ ARROWS = {
     "harness": {"vcp", "her", "ensemble", "envs_point", "harness"},
     "baselines": {"her", "baselines"},
     "experiments": {"run", "vcp", "her", "ensemble", "harness", "experiments"},
+    "examples": {"vcp", "her", "ensemble"},
 }
 
 

@@ -6,14 +6,14 @@ import shlex
 import shutil
 import subprocess
 import sys
+import textwrap
 
-import numpy as np
 import pytest
 
 import run
 from harness import cli, settings
 from harness.play import play
-from harness.testing import HERE, exact_reward, numbered_episodes
+from harness.testing import HERE
 
 TEXTS = sorted(
     file
@@ -44,13 +44,12 @@ def commands() -> list[str]:
     return [*found]
 
 
-def test_the_snippet_to_copy_runs():
+def test_the_snippet_to_copy_is_cut_from_the_example_that_learns():
     (snippet,) = [text for text in SNIPPETS if "update_her_buffer" in text]
-    names = {"rng": np.random.default_rng(0), "your_reward_fn": exact_reward}
-    names["your_episodes"] = numbered_episodes(16)
-    exec(snippet, names)
-    assert names["her_buffer"].size == 5 * 1024 == names["her_buffer"].capacity
-    assert names["agent"].optimizer.state
+    imports, algorithm = snippet.split("\n\n")
+    example = (HERE / "examples" / "own_task.py").read_text()
+    assert f"\n{imports}\n" in example
+    assert textwrap.indent(algorithm, "    ") in example
 
 
 def test_the_environment_to_copy_is_learned(tmp_path):
