@@ -187,7 +187,7 @@ def tables(tasks: Tasks) -> dict[str, list[str]]:
 def panels_of(plan: str, methods: dict[str, list[Run]]) -> dict[str, Lines]:
     """What there is to compare on a task, by panels of its figure."""
     variants, panels = [name for name in methods if name.startswith("VCP")], {}
-    parts = {"others with one network": ONE_NETWORK, "16 heads": ENSEMBLES, "variants": variants}
+    parts = {"VCP and one network": ONE_NETWORK, "16 heads": ENSEMBLES, "variants of VCP": variants}
     for text, names in parts.items():
         chosen = {name: methods[name] for name in names if name in methods}
         if len(chosen) > 1:

@@ -152,6 +152,18 @@ def test_the_summary(results):
     assert "heads_at_once" not in (results / "Reacher-v2" / "README.md").read_text()  # stopped
 
 
+def test_every_table_in_results_is_generated():
+    """And is that of the runs that are there: make it again and compare."""
+    tables = figures.tables(figures.by_task(figures.read_runs(figures.RESULTS)))
+    files = figures.RESULTS.rglob("README.md")
+    assert {str(file.relative_to(figures.RESULTS)) for file in files} == {*tables}
+    for name, lines in tables.items():
+        before, generated = (figures.RESULTS / name).read_text().split(figures.BEGIN)
+        generated, after = generated.split(figures.END)
+        assert generated.strip() == "\n".join(lines).strip(), f"{name}: figures summary"
+        assert not re.search(r"^\|", before + after, re.M), f"{name} has a table that is typed"
+
+
 def test_runs_are_compared_by_seed_and_machine(tmp_path):
     """A pair is of one seed: on the same kind of machine and, where there is none, on different."""
     ours = [("vcp", 0, "cpu"), ("vcp", 0, "cuda"), ("vcp", 1, "cuda"), ("vcp", 2, "cpu")]
