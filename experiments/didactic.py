@@ -1,8 +1,8 @@
-"""Figures 3, 5 and 8, from runs on PointMassEmpty: python -m experiments.didactic [NAME...]
+"""Figures 3, 5 and 8, from runs on PointMassEmpty: python -m experiments.didactic
 
 Trains the runs below runs/didactic, or goes on with them, and writes what the figures need of their
-networks and buffers to results/didactic/NAME.npz. Figure 4's run is among them: half16. The second
-half of this file draws the figures from the arrays; `experiments.figures` calls it.
+networks and buffers to results/didactic/NAME.npz. The second half of this file draws the figures
+from these arrays; `experiments.figures` calls it.
 """
 
 import argparse
@@ -58,9 +58,8 @@ def figure_3(config: Config) -> dict[str, np.ndarray]:
     t = rng.integers(50, size=TRAJECTORIES)
     variance = []
     for row, step in zip(rows, t, strict=True):
-        goals = episodes["achieved_goal"][row]
-        here = [np.repeat(episodes[k][row, [step]], len(goals), axis=0) for k in ("obs", "action")]
-        variance.append(agent.q_variance(*here, goals))
+        here = [np.repeat(episodes[k][row, [step]], 51, axis=0) for k in ("obs", "action")]
+        variance.append(agent.q_variance(*here, episodes["achieved_goal"][row]))
     return {"xy": episodes["obs"][rows], "t": t, "variance": np.stack(variance)}
 
 
@@ -72,15 +71,15 @@ def figure_5(config: Config) -> dict[str, np.ndarray]:
         parts = trained(config, epoch)
         original, her_buffer = parts.original_buffer, parts.her_buffer
         rng = np.random.default_rng(epoch)
-        episodes = original.episodes
         e, t = rng.integers(original.size, size=SHOWN), rng.integers(50, size=SHOWN)
-        points[f"original_{epoch}"] = np.hstack(
-            [episodes["obs"][e, t], episodes["desired_goal"][e]]
-        )
         i = rng.choice(her_buffer.size, SHOWN, replace=False)
-        points[f"her_{epoch}"] = np.hstack([her_buffer.data[k][i] for k in ("obs", "goal")])
         drawn = her_buffer.sample(SHOWN, rng)
-        points[f"drawn_{epoch}"] = np.hstack([drawn["obs"], drawn["goal"]])
+        kinds = {
+            "original": [original.episodes["obs"][e, t], original.episodes["desired_goal"][e]],
+            "her": [her_buffer.data[name][i] for name in ("obs", "goal")],
+            "drawn": [drawn["obs"], drawn["goal"]],
+        }
+        points |= {f"{kind}_{epoch}": np.hstack(arrays) for kind, arrays in kinds.items()}
         points[f"effective_{epoch}"] = np.array(effective_share(her_buffer.probabilities))
     return {name: x.astype(np.float32) for name, x in points.items()}
 
@@ -95,22 +94,6 @@ def figure_8(config: Config) -> dict[str, np.ndarray]:
         "variance": agent.q_variance(rows["obs"], rows["action"], rows["goal"]),
         "probability": her_buffer.probabilities.astype(np.float32),
         "hindsight": rows["hindsight"],
-    }
-
-
-def jobs(out: Path) -> dict:
-    """What is made: for each file's name the function and the run it is made from."""
-
-    def config(name, **settings):
-        return Config(**SCHEDULE, **settings, out=str(out / name))
-
-    half = {"relabel_ratio": 0.5}  # Sections 5.4, 5.5, 5.8
-    small = {**half, "buffer_size": 10_000}  # Figure 5's caption
-    return {
-        "fig3": (figure_3, config("heads16")),
-        **{f"fig8_{k}": (figure_8, config(f"half{k}", **half, heads=k)) for k in SIZES},
-        "fig5_consistency": (figure_5, config("small_consistency", **small)),
-        "fig5_variance": (figure_5, config("small_variance", **small, priority="variance")),
     }
 
 
@@ -131,10 +114,11 @@ def distance_correlation(data: dict[str, np.ndarray]) -> list[float]:
     return result
 
 
-def draw_figure_3(data: dict[str, np.ndarray]) -> Figure:
+def draw_figure_3(folder: Path) -> Figure:
     """Figure 3: trajectories, coloured by the variance of (ŝ, its action, each achieved goal)."""
+    data = np.load(folder / "fig3.npz")
     fig = Figure(figsize=(8.3, 5.6), layout="constrained")
-    panels = fig.subplots(2, 3).flat
+    panels = list(fig.subplots(2, 3).flat)
     colour = np.log10(data["variance"])
     limits = {"vmin": colour.min(), "vmax": colour.max(), "cmap": "viridis"}
     for ax, xy, t, variance, r in zip(
@@ -147,8 +131,7 @@ def draw_figure_3(data: dict[str, np.ndarray]) -> Figure:
         ax.plot(*xy[t], "k^", markersize=9, label="ŝ")
         ax.set_title(f"rank correlation {r:+.2f}", fontsize=10)
         ax.set(aspect="equal", xlim=(-0.62, 0.62), ylim=(-0.62, 0.62), xticks=[], yticks=[])
-    for ax in list(fig.axes)[len(data["xy"]) :]:
-        ax.axis("off")
+    panels[-1].axis("off")
     fig.legend(*fig.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     fig.colorbar(points, ax=fig.axes, shrink=0.8, label="log₁₀ of the variance")
     fig.suptitle(
@@ -159,12 +142,13 @@ def draw_figure_3(data: dict[str, np.ndarray]) -> Figure:
     return fig
 
 
-def draw_figure_5(data: dict[str, dict[str, np.ndarray]]) -> Figure:
+def draw_figure_5(folder: Path) -> Figure:
     """Figure 5: where B_o, B_h and what is drawn from B_h lie, in a t-SNE map of (state, goal) that
-    is common to a row; and the density of what is drawn. data: the arrays of each priority."""
+    is common to a row; and the density of what is drawn."""
     from scipy.stats import gaussian_kde  # of requirements-experiments.txt
     from sklearn.manifold import TSNE
 
+    data = {priority: np.load(folder / f"fig5_{priority}.npz") for priority in PRIORITIES}
     fig = Figure(figsize=(8.3, 2.4 * len(STAGES) + 0.8), layout="constrained")
     panels = fig.subplots(len(STAGES), 4)
     for line, epoch in zip(panels, STAGES, strict=True):
@@ -198,19 +182,19 @@ def draw_figure_5(data: dict[str, dict[str, np.ndarray]]) -> Figure:
     return fig
 
 
-def draw_figure_8(data: dict[int, dict[str, np.ndarray]]) -> Figure:
+def draw_figure_8(folder: Path) -> Figure:
     """Figure 8: histograms of the variance in B_h for ensembles of K heads, and how often the
-    priority draws an original transition (Section 5.8). data: arrays by K."""
+    priority draws an original transition (Section 5.8)."""
+    data = {k: dict(np.load(folder / f"fig8_{k}.npz")) for k in SIZES}
     fig = Figure(figsize=(6.4, 1.5 * len(data) + 1), layout="constrained")
     panels = fig.subplots(len(data), 1, sharex=True, squeeze=False)[:, 0]
-    positive = np.concatenate([d["variance"] for d in data.values()])
-    low, high = np.quantile(positive[positive > 0], [0.001, 1])
-    bins = np.geomspace(low, high, 60)
-    for ax, (k, d) in zip(panels, sorted(data.items()), strict=True):
+    variances = np.concatenate([d["variance"] for d in data.values()])
+    bins = np.geomspace(*np.quantile(variances[variances > 0], [0.001, 1]), 60)
+    for ax, (k, d) in zip(panels, data.items(), strict=True):
         for kind, colour in ((True, BLUE), (False, RED)):
             variance = d["variance"][d["hindsight"] == kind]
             name = "hindsight" if kind else "original"
-            ax.hist(variance, bins, color=colour, alpha=0.6, density=False, label=name)
+            ax.hist(variance, bins, color=colour, alpha=0.6, label=name)
             ax.axvline(np.median(variance), color=colour, linestyle="--", linewidth=1)
         original = ~d["hindsight"]
         share, drawn = original.mean(), d["probability"][original].sum()
@@ -227,21 +211,25 @@ def draw_figure_8(data: dict[int, dict[str, np.ndarray]]) -> Figure:
     return fig
 
 
-# ------------------------------------------------------------------------------ the program
+DRAWN = {"fig3": draw_figure_3, "fig5": draw_figure_5, "fig8": draw_figure_8}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument(
-        "names", nargs="*", metavar="NAME", help="of the files to make (default: all)"
-    )
     parser.add_argument("--out", default="runs/didactic", help="the runs (default: runs/didactic)")
-    given = parser.parse_args()
-    made = jobs(Path(given.out))
-    if unknown := set(given.names) - made.keys():
-        parser.error(f"no {', '.join(sorted(unknown))}; there are {', '.join(made)}")
+    out = Path(parser.parse_args().out)
+
+    def arrays_of(function, name, **settings):
+        return function(Config(**SCHEDULE, **settings, out=str(out / name)))
+
+    half = {"relabel_ratio": 0.5}  # Sections 5.5 and 5.8
+    small = {**half, "buffer_size": 10_000}  # Figure 5's caption
     try:
-        arrays = {name: made[name][0](made[name][1]) for name in given.names or made}
+        arrays = {"fig3": arrays_of(figure_3, "heads16")}
+        for k in SIZES:
+            arrays[f"fig8_{k}"] = arrays_of(figure_8, f"half{k}", **half, heads=k)
+        for p in PRIORITIES:
+            arrays[f"fig5_{p}"] = arrays_of(figure_5, f"small_{p}", **small, priority=p)
     except UsageError as error:
         parser.error(str(error))
     folder = RESULTS / "didactic"

@@ -1,12 +1,13 @@
-"""The paper's figures from results/ alone: python -m experiments.figures NAME [--runs DIR]
+"""The paper's figures, and the tables by task, from results/ alone:
 
-Reads config.json and progress.csv of every run below results/, or below DIR, and writes NAME.png
-there. What a run is follows from its settings, whatever its folder is called.
+    python -m experiments.figures NAME [--runs DIR]
+
+reads config.json and progress.csv of every run below results/, or below DIR, and writes NAME.png
+there. For "summary" it writes each task's table and curves.png into <env>/, and a line a task into
+README.md. What a run is follows from its settings, whatever its folder is called.
 """
 
 import argparse
-import math
-import re
 import sys
 from collections import defaultdict
 from dataclasses import dataclass, replace
@@ -25,85 +26,79 @@ from harness.settings import Config
 # Okabe and Ito's colours, which colour-blind people can tell apart, and dashes for print
 COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"]
 DASHES = ["-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)), (0, (3, 1, 1, 1))]
-BASELINES = ("her", "herebp", "cher", "dtgsh")
+SHOWN = (1, 2, 5, 10, 20, 50)  # epochs in a task's table, beside the last
+BEGIN = "<!-- python -m experiments.figures summary writes what stands from here -->"
+END = "<!-- to here -->"
+Lines = dict[str, list[np.ndarray]]  # by label: a curve for each run
 
 
 @dataclass
 class Run:
     config: Config
+    gpu: bool  # whether it was trained on one
     rows: dict[str, np.ndarray]  # the columns of progress.csv, (epochs,) each
+
+    @property
+    def success(self) -> np.ndarray:
+        return self.rows["test_success_rate"]
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """Every run below `folder`."""
+    """Every run below `folder`, those on a GPU last and else by seed."""
     runs = []
-    for file in sorted(folder.rglob("progress.csv")):
-        rows = read_rows(file.parent)
-        if rows:
+    for file in folder.rglob("progress.csv"):
+        if rows := read_rows(file.parent):
             columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-            config = replace(settings.load(file.parent), device="cpu")
-            runs.append(Run(settings.complete(config), columns))
-    return runs
+            saved = settings.load(file.parent)
+            config = settings.complete(replace(saved, device="cpu"))
+            runs.append(Run(config, saved.device == "cuda", columns))
+    return sorted(runs, key=lambda run: (run.gpu, run.config.seed, run.config.out))
 
 
-def paper_schedule(c: Config) -> tuple[int, int, int]:
-    """Appendix B's cycles, updates and batch size."""
-    return tuple(settings.paper_schedule(c.env, c.method).values())[:3]
+Tasks = dict[tuple[str, str], dict[str, list[Run]]]  # the runs by (folder, schedule), then label
 
 
-def as_many_updates(c: Config) -> bool:
-    """Whether one network makes the updates that an ensemble of 16 makes."""
-    cycles, updates, batch_size = paper_schedule(c)
-    same = (c.cycles, c.updates, c.batch_size) == (cycles, 16 * updates, batch_size)
-    return c.heads == 1 and same
+def is_papers(c: Config, times: int = 1) -> bool:
+    """Whether the schedule is Appendix B's, with so many times the updates."""
+    paper = settings.paper_schedule(c.env, c.method)
+    paper["updates"] *= times
+    return paper == {name: getattr(c, name) for name in paper}
 
 
 # Settings that the panel's title or the label's own words say, or that need no saying.
-SCHEDULE = ("cycles", "updates", "batch_size")
-SAID_ELSEWHERE = (*SCHEDULE, "eval_episodes", "heads", "priority", "acting_head")
+SAID_ELSEWHERE = ("cycles", "updates", "batch_size", "eval_episodes", "heads", "priority")
 
 
 def label(c: Config) -> str:
     """What the legend calls the run: its method and what is not the paper's default."""
     parts = [c.method.upper()]
-    if as_many_updates(c):
+    if c.heads == 1 and is_papers(c, 16):  # those that an ensemble of 16 makes
         parts.append("16 times the updates")
     if c.heads != (16 if c.method == "vcp" else 1):
         parts.append(f"{c.heads} heads")
     if c.priority != "consistency":
         parts.append(f"{c.priority} priority")
-    if c.acting_head == "one":
-        parts.append("one acting head")
-    others = settings.differences(c).items()
-    return ", ".join(parts + [f"{name} {x}" for name, x in others if name not in SAID_ELSEWHERE])
+    others = {n: x for n, x in settings.differences(c).items() if n not in SAID_ELSEWHERE}
+    return ", ".join(parts + [f"{name} {x}" for name, x in others.items()])
 
 
-ABLATIONS = ("VCP", "VCP, uniform priority", "VCP, variance priority", "VCP, one acting head")
-FIGURES = {  # name: (what it is, which runs by their label)
-    "fig2": (
-        "Figure 2: VCP (16 heads) and the other methods with one network",
-        lambda name: name in ("VCP", *map(str.upper, BASELINES), "HER, 16 times the updates"),
-    ),
-    "fig4": ("Figure 4", lambda name: name == "VCP, relabel_ratio 0.5"),
-    "fig6": ("Figure 6: ablations of VCP", lambda name: name in ABLATIONS),
-    "fig7": (
-        "Figure 7: VCP with ensembles of other sizes",
-        lambda name: re.fullmatch(r"VCP(, \d+ heads)?", name),
-    ),
-    "fig9": (
-        "Figure 9: VCP and the other methods with the same ensemble",
-        lambda name: name in ("VCP", *(f"{m.upper()}, 16 heads" for m in BASELINES)),
-    ),
-}
+def schedule(c: Config) -> str:
+    """What is other than in Appendix B, for a title."""
+    if is_papers(c) or (c.heads == 1 and is_papers(c, 16)):
+        return ""
+    return f"{c.cycles} cycle{'s' * (c.cycles > 1)} of {c.updates} updates of batch {c.batch_size}"
 
 
-def smoothed(x: np.ndarray, weight: float) -> np.ndarray:
-    """Exponential moving average along the last axis; 0 leaves x as it is."""
-    y = x.astype(float)
-    for t in range(1, x.shape[-1]):
-        y[..., t] = weight * y[..., t - 1] + (1 - weight) * x[..., t]
-    return y
+def by_task(runs: list[Run]) -> Tasks:
+    """The runs by task, the paper's schedule first; in these by label, VCP's first."""
+    tasks = defaultdict(lambda: defaultdict(list))
+    for run in sorted(runs, key=lambda run: (run.config.method != "vcp", label(run.config))):
+        folder = settings.default_folder(run.config).split("/")[0]  # called by the environment
+        tasks[folder, schedule(run.config)][label(run.config)].append(run)
+    return dict(sorted(tasks.items()))
 
+
+# ------------------------------------------------------------------------------ numbers
 
 # Student's t, 0.975, by the number of seeds; for fewer no interval is given
 T_975 = {5: 2.776, 6: 2.571, 7: 2.447, 8: 2.365, 9: 2.306, 10: 2.262}
@@ -118,239 +113,226 @@ def interval(x: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     return x.mean(axis=0) - half, x.mean(axis=0) + half
 
 
-def said(x: np.ndarray) -> str:
-    """The mean over seeds with its interval, or with the seeds' own numbers where they are few."""
+def said(x: np.ndarray, sign: str = "") -> str:
+    """The mean over seeds with its interval, or with the seeds' own numbers where they are few.
+    sign: "+" for differences."""
+
+    def number(value):
+        return f"{np.round(value, 3) + 0.0:{sign}.3f}"  # no -0.000
+
+    if len(x) == 1:
+        return number(x[0])
     ends = interval(x)
-    spread = "{:.3f}-{:.3f}".format(*ends) if ends else " ".join(f"{seed:.3f}" for seed in x)
-    return f"{x.mean():.3f} ({spread})" if len(x) > 1 else f"{x.mean():.3f}"
+    spread = " to ".join(map(number, ends)) if ends else " ".join(map(number, x))
+    return f"{number(x.mean())} ({spread})"
 
 
-def draw_line(ax: Axes, seeds: list[np.ndarray], style: int, text: str, smooth: float) -> None:
+def pairs(ours: list[Run], theirs: list[Run]) -> list[tuple[Run, Run]]:
+    """Runs of the same seed: on the same kind of machine and, of a seed that has no such pair, on
+    different ones."""
+    both = [(a, b) for a in ours for b in theirs if a.config.seed == b.config.seed]
+    found = [(a, b) for a, b in both if a.gpu == b.gpu]
+    paired = {a.config.seed for a, _ in found}
+    return found + [(a, b) for a, b in both if a.config.seed not in paired]
+
+
+def table(methods: dict[str, list[Run]], epochs: int) -> list[str]:
+    """A task's methods over the first `epochs`, of the runs that have them."""
+    long = {name: [r for r in runs if len(r.success) >= epochs] for name, runs in methods.items()}
+    shown = sorted({*(epoch for epoch in SHOWN if epoch < epochs), epochs})
+    columns = ["method", "seeds", f"success after epochs {', '.join(map(str, shown))}"]
+    columns += [f"mean of {epochs} epochs", "VCP ahead by"]
+    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+    for name, runs in long.items():
+        if not runs:
+            continue
+        curves = np.stack([run.success[:epochs] for run in runs])
+        compared = pairs(long.get("VCP", []), runs) if name != "VCP" else []
+        ahead = [np.mean(a.success[:epochs] - b.success[:epochs]) for a, b in compared]
+        seeds = ",".join(f"{'g' * run.gpu}{run.config.seed}" for run in runs)
+        cells = [name, seeds, " ".join(f"{curves[:, e - 1].mean():.2f}" for e in shown)]
+        cells += [said(curves.mean(axis=1)), said(np.array(ahead), "+") if ahead else ""]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def put(path: Path, lines: list[str]) -> None:
+    """Write the lines between the two marks of a text, or at its end if it has none."""
+    before, _, rest = (path.read_text() if path.exists() else "").partition(BEGIN)
+    text, after = "\n".join(lines).strip(), rest.partition(END)[2] or "\n"
+    path.write_text(f"{before}{BEGIN}\n\n{text}\n\n{END}{after}")
+
+
+def tables(tasks: Tasks) -> dict[str, list[str]]:
+    """The lines for each README.md: of a task over the epochs that all its runs have, and over as
+    many as VCP's longest run; and of all tasks a line each."""
+    columns = ("VCP", "VCP, uniform priority", "HER, 16 heads", "HER")
+    lines = [f"| task | epochs | {' | '.join(columns)} |", "|---" * (2 + len(columns)) + "|"]
+    texts = defaultdict(list, {"README.md": lines})
+    for (folder, plan), methods in tasks.items():
+        name = f"{folder}/README.md"
+        shortest = min(len(run.success) for runs in methods.values() for run in runs)
+        longest = max((len(run.success) for run in methods.get("VCP", [])), default=shortest)
+        for epochs in sorted({shortest, longest}):
+            heading = f"{plan or 'Schedule of Appendix B'}, {epochs} epochs:"
+            texts[name] += ["", heading, "", *table(methods, epochs)]
+        cells = [f"[{folder}]({name}){plan and f', {plan}'}", str(shortest)]
+        for method in columns:
+            means = [run.success[:shortest].mean() for run in methods.get(method, [])]
+            cells.append(f"{np.mean(means):.2f} ({len(means)})" if means else "")
+        lines.append(f"| {' | '.join(cells)} |")
+    return texts
+
+
+def panels_of(plan: str, methods: dict[str, list[Run]]) -> dict[str, Lines]:
+    """What there is to compare on a task, by panels of its figure."""
+    variants, panels = [name for name in methods if name.startswith("VCP")], {}
+    parts = {"VCP and one network": ONE_NETWORK, "16 heads": ENSEMBLES, "variants of VCP": variants}
+    for text, names in parts.items():
+        chosen = {name: methods[name] for name in names if name in methods}
+        if len(chosen) > 1:
+            panels["\n".join(filter(None, (text, plan)))] = success(chosen)
+    return panels or {plan: success(methods)}
+
+
+def summary(runs: list[Run], results: Path) -> Path:
+    """Write the tables and the tasks' figures, without runs that were stopped before their last
+    epoch."""
+    tasks = by_task([run for run in runs if len(run.success) >= run.config.epochs])
+    panels = defaultdict(dict)
+    for (folder, plan), methods in tasks.items():
+        panels[folder] |= panels_of(plan, methods)
+    for folder, drawn in panels.items():
+        (results / folder).mkdir(exist_ok=True)
+        curves(drawn, folder).savefig(results / folder / "curves.png", dpi=100)
+    for name, lines in tables(tasks).items():
+        put(results / name, lines)
+    return results / "README.md"
+
+
+# ------------------------------------------------------------------------------ pictures
+
+ONE_NETWORK = ("VCP", "HER", "HER, 16 times the updates", "HEREBP", "CHER", "DTGSH")
+ENSEMBLES = ("VCP", "HER, 16 heads", "HEREBP, 16 heads", "CHER, 16 heads", "DTGSH, 16 heads")
+ABLATIONS = ("VCP", "VCP, uniform priority", "VCP, variance priority", "VCP, acting_head one")
+SIZES = ("VCP", *(f"VCP, {k} heads" for k in didactic.SIZES))
+FIGURES = {  # name: (what it is, which runs by their label)
+    "fig2": ("Figure 2: VCP (16 heads) and the other methods with one network", ONE_NETWORK),
+    "fig4": ("Figure 4: the variance on hindsight and on original transitions", ("VCP",)),
+    "fig6": ("Figure 6: ablations of VCP", ABLATIONS),
+    "fig7": ("Figure 7: VCP with ensembles of other sizes", SIZES),
+    "fig9": ("Figure 9: VCP and the other methods with the same ensemble", ENSEMBLES),
+}
+
+
+def success(methods: dict[str, list[Run]]) -> Lines:
+    return {name: [run.success for run in runs] for name, runs in methods.items()}
+
+
+def draw_line(ax: Axes, seeds: list[np.ndarray], style: int, text: str) -> None:
     """The mean over seeds by epoch, as far as all of them have come, and its interval; where the
     seeds are too few for one, a thin line for each of them."""
-    seeds = [smoothed(seed, smooth) for seed in seeds]
     shortest = min(map(len, seeds))
     y = np.stack([seed[:shortest] for seed in seeds])
-    epochs = np.arange(1, shortest + 1)
-    how = {"color": COLOURS[style], "linestyle": DASHES[style]}
-    marker = "o" if shortest == 1 else ""  # a line of one
-    ax.plot(epochs, y.mean(axis=0), **how, label=text, marker=marker)
-    ends = interval(y)
-    if ends:
-        ax.fill_between(epochs, *ends, color=COLOURS[style], alpha=0.15, linewidth=0)
+    epochs, number = np.arange(1, shortest + 1), len(COLOURS)
+    dash = DASHES[(style + style // number) % number]
+    how = {"color": COLOURS[style % number], "linestyle": dash}
+    ax.plot(epochs, y.mean(axis=0), **how, label=text, marker="o" if shortest == 1 else "")
+    if ends := interval(y):
+        ax.fill_between(epochs, *ends, color=how["color"], alpha=0.15, linewidth=0)
     elif len(seeds) > 1:
         for seed in seeds:
             ax.plot(np.arange(1, len(seed) + 1), seed, **how, linewidth=0.7, alpha=0.6)
 
 
-def schedule(c: Config) -> str:
-    """What is other than in Appendix B, for a title: nothing or a line."""
-    if (c.cycles, c.updates, c.batch_size) == paper_schedule(c) or as_many_updates(c):
-        return ""
-    return f"\n{c.cycles} cycles of {c.updates} updates of batch {c.batch_size}"
-
-
-def curves(runs: list[Run], title: str, smooth: float) -> Figure:
-    """A panel for each environment in which there is something to compare VCP with or, if there is
-    none, for each environment: test success by epoch of every method in `runs`."""
-    runs = sorted(runs, key=lambda r: (r.config.method != "vcp", label(r.config) != "VCP"))
-    names = list(dict.fromkeys(label(run.config) for run in runs))
-    by_env = defaultdict(lambda: defaultdict(list))
-    for run in runs:
-        by_env[run.config.env + schedule(run.config)][label(run.config)].append(
-            run.rows["test_success_rate"]
-        )
-    compared = {env: runs for env, runs in by_env.items() if len(runs) > 1 and "VCP" in runs}
-    by_env = compared or by_env
-    columns = min(len(by_env), 3)
-    lines = -(-len(by_env) // columns)
+def curves(panels: dict[str, Lines], title: str, what: str = "test success rate") -> Figure:
+    """A panel for each title, in it a line for each label. Another thing than a rate is drawn on a
+    logarithmic scale."""
+    names = list(dict.fromkeys(name for methods in panels.values() for name in methods))
+    columns = min(len(panels), 3)
+    lines = -(-len(panels) // columns)
     fig = Figure(figsize=(8.3, 2.9 * lines + 1.1), layout="constrained")
-    panels = fig.subplots(lines, columns, squeeze=False, sharey=True).flat
+    axes = fig.subplots(lines, columns, squeeze=False, sharey=True).flat
     entries = {}
-    for ax, (env, methods) in zip(panels, sorted(by_env.items()), strict=False):
+    for ax, (text, methods) in zip(axes, panels.items(), strict=False):
         for name, seeds in methods.items():
-            draw_line(ax, seeds, names.index(name), name, smooth)
+            draw_line(ax, seeds, names.index(name), name)
         few, many = min(map(len, methods.values())), max(map(len, methods.values()))
-        seeds = f"{few}" if few == many else f"{few} to {many}"
-        env, _, its_schedule = env.partition("\n")
-        between = "\n" if len(env) > 20 else ", "
-        panel = f"{env}{between}{seeds} seed{'s' * (many > 1)}\n{its_schedule}"
-        ax.set_title(panel.strip(), fontsize=10)
-        ax.set(xlabel="epoch", ylim=(-0.03, 1.03))
+        number = f"{few}" if few == many else f"{few} to {many}"
+        ax.set_title(f"{text}\n{number} run{'s' * (many > 1)}".strip(), fontsize=9)
+        ax.set(xlabel="epoch", **({"ylim": (-0.03, 1.03)} if "rate" in what else {"yscale": "log"}))
         ax.xaxis.get_major_locator().set_params(integer=True)
         ax.grid(alpha=0.3)
         entries |= dict(zip(*ax.get_legend_handles_labels()[::-1], strict=True))
-    for ax in list(fig.axes)[len(by_env) :]:
+    for ax in list(fig.axes)[len(panels) :]:
         ax.axis("off")
-    in_order = [name for name in names if name in entries]
-    handles = [entries[name] for name in in_order]
-    fig.legend(handles, in_order, loc="outside lower center", ncols=3, fontsize=9, handlelength=3)
-    how = f"; smoothed, weight {smooth}" if smooth else ""
-    fig.supylabel("test success rate", fontsize=10)
+    handles = [entries[name] for name in names]
+    fig.legend(handles, names, loc="outside lower center", ncols=3, fontsize=9, handlelength=3)
+    fig.supylabel(what, fontsize=10)
     means = "mean over seeds, with a 95 % interval from 5 on and each seed's line for fewer"
-    fig.suptitle(f"{title}\n{means}; Appendix B's schedule unless said{how}", fontsize=10)
+    fig.suptitle(f"{title}\n{means}", fontsize=10)
     return fig
 
 
-def figure_4(runs: list[Run], smooth: float) -> Figure:
-    """Figure 4: the critics' variance on hindsight and on original transitions, by epoch."""
-    fig = Figure(figsize=(4.6, 3.4), layout="constrained")
-    ax = fig.subplots()
-    for i, kind in enumerate(("hindsight", "original")):
-        draw_line(ax, [run.rows[f"variance_{kind}"] for run in runs], i, kind, smooth)
-    ax.set(xlabel="epoch", ylabel="variance of the 16 Q-values", yscale="log")
-    c = runs[0].config
-    title = f"Figure 4: {c.env}, half originals, seeds: {len(runs)}{schedule(c)}"
-    ax.set_title(title, fontsize=9)
-    ax.grid(alpha=0.3)
-    ax.legend()
-    return fig
+def paper_figure(name: str, runs: list[Run]) -> Figure:
+    """A panel for each task in which there is something to compare VCP with or, if there is none,
+    for each task; of Figure 4 for each."""
+    tasks = {"\n".join(filter(None, task)): methods for task, methods in by_task(runs).items()}
+    title = f"{FIGURES[name][0]}; Appendix B's schedule unless said"
+    if name == "fig4":
+        kinds = {kind: f"variance_{kind}" for kind in ("hindsight", "original")}
+        panels = {
+            task: {k: [run.rows[column] for run in methods["VCP"]] for k, column in kinds.items()}
+            for task, methods in tasks.items()
+        }
+        return curves(panels, title, "variance of the 16 Q-values")
+    compared = {task: methods for task, methods in tasks.items() if {"VCP"} < methods.keys()}
+    return curves({task: success(m) for task, m in (compared or tasks).items()}, title)
 
 
-def interquartile_mean(x: np.ndarray) -> float:
-    """The mean of the middle half of all entries (Agarwal et al., 2021)."""
-    x = np.sort(x, axis=None)
-    cut = len(x) // 4
-    return float(x[cut : len(x) - cut].mean())
+# ------------------------------------------------------------------------------ the program
+
+NAMES = [*sorted([*FIGURES, *didactic.DRAWN]), "summary"]
 
 
-def summary(runs: list[Run], last: int = 5, draws: int = 2000) -> str:
-    """Two tables. For each environment and method, over the epochs that all runs of the environment
-    have and, if the longest of VCP has more, over as many, from the seeds that have them: the first
-    with a success of 0.95 and the minutes that one took (medians over seeds), the mean success, and
-    that of the last ones, as `said`. For each method that shares more than one environment with
-    VCP, over the epochs that all runs have: the interquartile mean of all seeds' mean successes for
-    both, on the shared ones, each of the same weight, with a bootstrap that draws seeds within
-    each. Runs that were stopped before their last epoch are left out."""
-    success = defaultdict(lambda: defaultdict(list))
-    minutes = defaultdict(list)
-    for run in runs:
-        epochs = len(run.rows["epoch"])
-        if epochs < run.config.epochs:
-            continue
-        key = run.config.env + schedule(run.config).replace("\n", ", ")
-        success[key][label(run.config)].append(run.rows["test_success_rate"])
-        minutes[key, label(run.config)].append(run.rows["wall_seconds"][-1] / epochs / 60)
-    lines, means = [], defaultdict(dict)
-    for env, methods in sorted(success.items()):
-        shortest = min(len(curve) for seeds in methods.values() for curve in seeds)
-        longest = max(map(len, methods.get("VCP", [])), default=shortest)
-        for epochs in sorted({shortest, longest}):
-            for name, seeds in sorted(methods.items()):
-                seeds = [curve[:epochs] for curve in seeds if len(curve) >= epochs]
-                if not seeds:
-                    continue
-                firsts = [np.flatnonzero(curve >= 0.95)[:1] + 1 for curve in seeds]
-                first = np.median([f[0] if len(f) else np.inf for f in firsts])
-                mean = np.array([curve.mean() for curve in seeds])
-                end = np.array([curve[-last:].mean() for curve in seeds])
-                columns = [
-                    str(len(seeds)),
-                    str(epochs),
-                    "never" if np.isinf(first) else f"{first:g}",
-                ]
-                columns += [said(mean), said(end), f"{np.median(minutes[env, name]):.2f}"]
-                lines.append(f"| {env} | {name} | {' | '.join(columns)} |")
-                if epochs == shortest:
-                    means[name][env] = mean
-
-    def total(scores: list[np.ndarray]) -> str:
-        seeds = math.lcm(*map(len, scores))  # so that each environment counts the same
-
-        def middle(scores):
-            return interquartile_mean(np.stack([np.repeat(x, seeds // len(x)) for x in scores]))
-
-        if min(map(len, scores)) < min(T_975):
-            return f"{middle(scores):.3f}"
-        rng = np.random.default_rng(0)
-        drawn = [middle([rng.choice(x, len(x)) for x in scores]) for _ in range(draws)]
-        low, high = np.quantile(drawn, [0.025, 0.975])
-        return f"{middle(scores):.3f} ({low:.3f}-{high:.3f})"
-
-    totals = []
-    for name, by_env in sorted(means.items()):
-        shared = [env for env in by_env if env in means["VCP"]]
-        if name != "VCP" and len(shared) > 1:
-            both = (total([means[n][env] for env in shared]) for n in (name, "VCP"))
-            totals.append(f"| {name} | {'; '.join(shared)} | {' | '.join(both)} |")
-    columns = ("seeds", "epochs", "first at .95", "mean", f"last {last}", "minutes an epoch")
-    head = [f"| environment | method | {' | '.join(columns)} |", "|---" * (2 + len(columns)) + "|"]
-    tables = [*head, *lines]
-    if totals:
-        tables += ["", "| method | environments | interquartile mean of the mean | VCP's |"]
-        tables += ["|---|---|---|---|"]
-    return "\n".join([*tables, *totals]) + "\n"
-
-
-def from_arrays(name: str, folder: Path) -> Figure:
-    """fig3, fig5 or fig8, from the .npz files of experiments.didactic. FileNotFoundError if they
-    are not there."""
-
-    def load(stem):
-        return dict(np.load(folder / f"{stem}.npz"))
-
-    if name == "fig3":
-        return didactic.draw_figure_3(load("fig3"))
-    if name == "fig5":
-        return didactic.draw_figure_5({p: load(f"fig5_{p}") for p in didactic.PRIORITIES})
-    sizes = [int(file.stem.removeprefix("fig8_")) for file in folder.glob("fig8_*.npz")]
-    if not sizes:
-        raise FileNotFoundError(folder / "fig8_*.npz")
-    return didactic.draw_figure_8({k: load(f"fig8_{k}") for k in sizes})
-
-
-def draw(name: str, results: Path = RESULTS, smooth: float = 0.0) -> Path:
-    """Write NAME.png, or .md for the summary, into `results`, and give its path."""
+def draw(name: str, results: Path = RESULTS) -> Path:
+    """Write NAME.png, or the tables for "summary", into `results`, and give its path."""
     path = results / f"{name}.png"
-    if name in ARRAYS:
+    if name in didactic.DRAWN:
         try:
-            from_arrays(name, results / "didactic").savefig(path, dpi=100)
+            didactic.DRAWN[name](results / "didactic").savefig(path, dpi=100)
         except FileNotFoundError as error:
-            sys.exit(f"figures.py: {error.filename or error} is missing: experiments.didactic")
+            sys.exit(f"figures.py: {error.filename} is missing: experiments.didactic")
         except ModuleNotFoundError as error:
             sys.exit(f"figures.py: {name}: {error}: pip install -r requirements-experiments.txt")
         return path
-    belongs = FIGURES[name][1] if name in FIGURES else lambda name: True
-    chosen = [run for run in read_runs(results) if belongs(label(run.config))]
-    kinds = {label(run.config) for run in chosen}
-    if len(kinds) < (2 if name in ("fig6", "fig7", "fig9") else 1):
+    runs = read_runs(results)
+    labels = {label(run.config) for run in runs}
+    compared = labels.intersection(FIGURES[name][1]) if name in FIGURES else labels
+    if len(compared) < (2 if name in ("fig6", "fig7", "fig9") else 1):
         sys.exit(f"figures.py: {name} compares runs that are not in {results}")
+    runs = [run for run in runs if label(run.config) in compared]
     if name == "summary":
-        path = results / "summary.md"
-        path.write_text(summary(chosen))
-        return path
-    title = FIGURES[name][0]
-    if name == "fig4":
-        fig = figure_4(chosen, smooth)
-    else:
-        fig = curves(chosen, title, smooth)
-    fig.savefig(path, dpi=100)
+        return summary(runs, results)
+    paper_figure(name, runs).savefig(path, dpi=100)
     return path
 
 
-ARRAYS = ("fig3", "fig5", "fig8")
-NAMES = [*sorted([*FIGURES, *ARRAYS]), "summary"]
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0].rstrip(":"))
     parser.add_argument("name", choices=[*NAMES, "all"], help="the picture, or the table, to make")
-    parser.add_argument(
-        "--smooth", type=float, default=0.0, help="of the curves; the paper's: 0.9, or 0.6"
-    )
     parser.add_argument(
         "--runs", type=Path, default=RESULTS, metavar="DIR", help="your own (default: results/)"
     )
     given = parser.parse_args()
     if not given.runs.is_dir():
         parser.error(f"there is no folder {given.runs}")
-    if given.name != "all":
-        print(draw(given.name, given.runs, given.smooth))
-        return
-    for name in NAMES:
+    for name in NAMES if given.name == "all" else [given.name]:
         try:
-            print(draw(name, given.runs, given.smooth))
+            print(draw(name, given.runs))
         except SystemExit as missing:  # the others can be drawn
+            if given.name != "all":
+                raise
             print(missing, file=sys.stderr)
 
 

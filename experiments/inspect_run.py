@@ -5,15 +5,13 @@ WHAT is one of
                  B_h, 1 / Σ p², as a share of its transitions (100 % is uniform), and the share of
                  originals among the draws
     replayed     what each method would draw from the run's B_o: the share of originals, and of
-                 transitions whose goal is still ahead (r = -1), among all draws and weighted by the
-                 paper's weights. In a task with an object the others are mostly at their goal
-                 because nothing has touched it
+                 transitions whose goal is still ahead (r = -1). In a task with an object the
+                 others are mostly at their goal because nothing has touched it
     dead         the share of the networks' hidden units that are 0 for all of 4,096 transitions,
                  and learn no more
 """
 
 import argparse
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -45,9 +43,9 @@ def effective(parts: Parts) -> list[str]:
     return [f"{effective_share(p):.1%}; {p[~data['hindsight']].sum():.1%}" for p in priorities]
 
 
-def drawn(parts: Parts, method: str, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """What `method` draws from the run's B_o, with the batch and the B_h of Appendix B's larger
-    tasks: reward, hindsight and weight, (BATCHES·B,) each."""
+def shares(parts: Parts, method: str, rng: np.random.Generator) -> dict[str, float]:
+    """Of what `method` draws from the run's B_o, with the batch and the B_h of Appendix B's larger
+    tasks, the share of originals and of transitions on their way."""
     schedule = settings.paper_schedule("FetchPush-v1", method)
     config = settings.complete(
         Config(env=parts.config.env, method=method, heads=parts.config.heads, **schedule)
@@ -59,19 +57,8 @@ def drawn(parts: Parts, method: str, rng: np.random.Generator) -> dict[str, np.n
     else:
         replay.new_episodes(np.arange(parts.original_buffer.size))
     batches = [replay.sample(config.batch_size, rng) for _ in range(BATCHES)]
-    names = ("reward", "hindsight", "weight")
-    return {name: np.concatenate([batch[name] for batch in batches]) for name in names}
-
-
-def shares(batch: dict[str, np.ndarray]) -> dict[str, float]:
-    """Of what was drawn: the originals and what is ahead, each also by weight."""
-    kinds = {"originals": ~batch["hindsight"], "ahead": batch["reward"] < 0}
-    weights = {"": np.ones_like(batch["weight"]), " weighted": batch["weight"]}
-    return {
-        f"{kind}{how}": float(np.average(chosen, weights=w))
-        for kind, chosen in kinds.items()
-        for how, w in weights.items()
-    }
+    originals = np.mean([~batch["hindsight"] for batch in batches])
+    return {"originals": originals, "ahead": np.mean([batch["reward"] < 0 for batch in batches])}
 
 
 def replayed(parts: Parts) -> list[str]:
@@ -80,11 +67,8 @@ def replayed(parts: Parts) -> list[str]:
     for method in METHODS:
         if method == "vcp" and parts.config.heads == 1:
             cells.append("")
-            continue
-        x = {name: f"{share:.1%}" for name, share in shares(drawn(parts, method, rng)).items()}
-        if method == "vcp":
-            x = {n: f"{x[n]} ({x[f'{n} weighted']})" for n in ("originals", "ahead")}
-        cells.append(f"{x['originals']}; {x['ahead']}")
+        else:
+            cells.append("; ".join(f"{share:.1%}" for share in shares(parts, method, rng).values()))
     return cells
 
 
@@ -123,7 +107,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="inspect_run.py",
         description=__doc__,
-        formatter_class=partial(argparse.RawDescriptionHelpFormatter, max_help_position=12),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("what", choices=TABLES)
     parser.add_argument("folders", nargs="+", type=Path, metavar="DIR")

@@ -19,10 +19,8 @@ import shlex
 import signal
 import sys
 import traceback
-from collections.abc import Iterable
 from dataclasses import asdict, fields
 from pathlib import Path
-from statistics import median
 
 from tqdm import tqdm
 
@@ -34,8 +32,7 @@ from harness.settings import Config
 from harness.tasks import make_env
 
 ROOT = Path(__file__).parent.parent
-OF_THE_SWEEP = ("env", "seed", "out")
-TYPES = {f.name: options.kind(f) for f in fields(Config) if f.name not in OF_THE_SWEEP}
+TYPES = {f.name: options.kind(f) for f in fields(Config) if f.name not in ("env", "seed", "out")}
 
 
 def settings(text: str) -> dict:
@@ -61,23 +58,20 @@ def seeds(text: str) -> list[int]:
     return seeds
 
 
-def all_runs(
-    envs: list[str], variants: list[str], seeds: list[int], common: dict, out: Path
-) -> list[Config]:
-    """The configs of a sweep, seeds last, so that the first of each is done before the second of
-    any. UsageError if one of them cannot be run."""
+def all_runs(which: argparse.Namespace, given: argparse.Namespace) -> list[Config]:
+    """The configs of what WHICH parsed, seeds last, so that the first of each is done before the
+    second of any. UsageError if one of them cannot be run."""
+    common = {**settings(which.set), "num_workers": given.cores, "threads": given.cores}
     runs = []
-    for seed in seeds:
-        for env in envs:
-            for variant in variants:
-                given = {**common, **settings(variant)}
-                config = options.complete(Config(**given, env=env, seed=seed, out=""))
-                config.out = str(Path(out, options.default_folder(config)))
+    for seed in which.seeds:
+        for env in which.env:
+            for variant in which.variants:
+                config = Config(**{**common, **settings(variant)}, env=env, seed=seed, out="")
+                config = options.complete(config)
+                config.out = str(Path(given.out, options.default_folder(config)))
                 runs.append(config)
-    folders = [config.out for config in runs]
-    for folder in folders:
-        if folders.count(folder) > 1:
-            raise UsageError(f"two runs are the same: {folder}")
+    if len({config.out for config in runs}) < len(runs):
+        raise UsageError(f"two runs are the same: {' '.join(which.variants)}")
     return runs
 
 
@@ -92,50 +86,14 @@ def planned(file: Path, given: argparse.Namespace) -> list[Config]:
     runs = []
     for number, line in enumerate(lines, 1):
         try:
-            arguments = shlex.split(line, comments=True)
-            if not arguments:
-                continue
-            line_given, unknown = parser.parse_known_args(arguments)
-            if unknown or not line_given.env:
-                raise UsageError(f"unknown: {' '.join(unknown)}" if unknown else "no --env")
-            common = {
-                **settings(line_given.set),
-                "num_workers": given.cores,
-                "threads": given.cores,
-            }
-            runs += all_runs(
-                line_given.env, line_given.variants, line_given.seeds, common, Path(given.out)
-            )
+            if arguments := shlex.split(line, comments=True):
+                which, unknown = parser.parse_known_args(arguments)
+                if unknown or not which.env:
+                    raise UsageError(f"unknown: {' '.join(unknown)}" if unknown else "no --env")
+                runs += all_runs(which, given)
         except (argparse.ArgumentError, ValueError) as error:
             raise UsageError(f"{file}, line {number}: {error}") from error
     return runs
-
-
-def check_environments(runs: list[Config]) -> None:
-    """UsageError for an environment that cannot be learned in."""
-    for env, length in dict.fromkeys((config.env, config.episode_length) for config in runs):
-        make_env(env, length).close()
-
-
-def hours_left(runs: list[Config]) -> str:
-    """How long the runs that are not whole take, by the time that an epoch of theirs took so far
-    or, of one that has not begun, of others of its environment and method."""
-    hours: dict[tuple, list[float]] = {}
-
-    def alike(config):
-        return config.env, config.method, config.heads, config.cycles, config.updates
-
-    for config in {config.out: config for config in runs}.values():
-        if epochs_done(config):
-            rows = records.read_rows(Path(config.out))
-            hours.setdefault(alike(config), []).append(rows[-1]["wall_seconds"] / len(rows) / 3600)
-    last = {config.out: config for config in sorted(runs, key=lambda config: config.epochs)}
-    left = [config for config in last.values() if epochs_done(config) < config.epochs]
-    known = [config for config in left if alike(config) in hours]
-    total = sum(median(hours[alike(c)]) * (c.epochs - epochs_done(c)) for c in known)
-    text = f"{len(left)} of {len(last)} runs are left"
-    text += f"; {len(known)} of them need {total:.1f} core-hours" if known else ""
-    return text + (f"; {len(left) - len(known)} are of a kind not timed yet" if left else "")
 
 
 def train_one(config: Config, here: str = ".") -> None:
@@ -168,8 +126,8 @@ def in_order(runs: list[Config]) -> dict:
     for config in runs:
         if epochs_done(config) >= config.epochs or config.out in failed:
             continue
-        print(hours_left(runs))
-        print(f"now {config.out}, {epochs_done(config)} of {config.epochs} epochs", flush=True)
+        print(f"{whole(runs)}, now {config.out}, {epochs_done(config)} of {config.epochs} epochs")
+        sys.stdout.flush()
         try:
             train_one(config, os.getcwd())
         except FolderInUse as error:
@@ -185,7 +143,7 @@ def in_ray(runs: list[Config], cores: float, gpus: float, address: str | None) -
     try:
         import ray
     except ModuleNotFoundError:
-        sys.exit("sweep.py: Ray is missing: pip install -r requirements-experiments.txt, or --task")
+        sys.exit("sweep.py: Ray is missing: pip install -r requirements-experiments.txt, or --plan")
 
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # it would report to its makers
     ray.init(
@@ -225,6 +183,11 @@ def epochs_done(config: Config) -> int:
     return records.epochs_done(Path(config.out))
 
 
+def whole(runs: list[Config]) -> str:
+    done = sum(epochs_done(config) >= config.epochs for config in runs)
+    return f"{done} of {len(runs)} runs are whole"
+
+
 WHICH = argparse.ArgumentParser(add_help=False)  # the runs: arguments, and lines of a plan
 WHICH.add_argument("--env", nargs="+", help="one or more, as for run.py")
 WHICH.add_argument(
@@ -238,7 +201,7 @@ WHICH.add_argument("--set", default="", metavar="NAME=VALUE,...", help="for all 
 WHICH.add_argument("--seeds", type=seeds, default="0", help="such as 0-4 or 0,3 (default: 0)")
 
 
-def main(argv: Iterable[str] | None = None) -> None:
+def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="sweep.py", description=__doc__.split("\n")[0], parents=[WHICH]
     )
@@ -248,35 +211,26 @@ def main(argv: Iterable[str] | None = None) -> None:
     parser.add_argument("--gpus", type=float, default=0, help="share of each run (default: 0)")
     parser.add_argument("--address", help="of a Ray cluster (default: Ray on this machine)")
     parser.add_argument("--list", action="store_true", help="print the runs and stop")
-    parser.add_argument("--task", type=int, help="train this one of --list here, without Ray")
     given = parser.parse_args(argv)
     try:
         if bool(given.plan) == bool(given.env):
             raise UsageError("one of --env and --plan is needed")
-        if given.plan:
-            runs = planned(Path(given.plan), given)
-        else:
-            common = {**settings(given.set), "num_workers": given.cores, "threads": given.cores}
-            runs = all_runs(given.env, given.variants, given.seeds, common, Path(given.out))
-        check_environments(runs)
-        if given.task is not None:
-            if not 0 <= given.task < len(runs):
-                raise UsageError(f"--task {given.task}: there are {len(runs)} runs, see --list")
-            return train_one(runs[given.task])
+        runs = planned(Path(given.plan), given) if given.plan else all_runs(given, given)
+        for env, length in dict.fromkeys((config.env, config.episode_length) for config in runs):
+            make_env(env, length).close()  # UsageError for one that cannot be learned in
     except UsageError as error:
         parser.error(str(error))
     if given.list:
         for i, config in enumerate(runs):
             print(f"{i:4} {epochs_done(config):4} of {config.epochs} epochs  {config.out}")
-        print(hours_left(runs), file=sys.stderr)
-        return None
+        print(whole(runs), file=sys.stderr)
+        return
     left = [config for config in runs if epochs_done(config) < config.epochs]
     if given.plan:
         failed = in_order(runs)
     else:
         failed = in_ray(left, given.cores, given.gpus, given.address) if left else {}
-    whole = sum(epochs_done(config) >= config.epochs for config in runs)
-    print(f"{whole} of {len(runs)} runs are whole")
+    print(whole(runs))
     for folder, error in failed.items():
         print(f"FAILED {folder}: {error} (error.txt there)")
     sys.exit(1 if failed else 0)
