@@ -290,9 +290,76 @@ def paper_figure(name: str, runs: list[Run]) -> Figure:
     return curves({task: success(m) for task, m in (compared or tasks).items()}, title)
 
 
+THREE_TASKS = ("FetchReach-v1", "FetchPush-v1", "HandReach-v0")
+
+
+def overview(runs: list[Run]) -> Figure:
+    """README's figure: four methods on three tasks, the lines labelled beside the last panel."""
+    names = ("VCP", "VCP, uniform priority", "HER, 16 heads", "HER")
+    found = by_task(runs)
+    tasks = {task: found.get((task, ""), {}) for task in THREE_TASKS}
+    if not all({*names} <= methods.keys() for methods in tasks.values()):
+        raise LookupError
+    fig = Figure(figsize=(8.3, 2.5), layout="constrained")
+    axes = fig.subplots(1, 3, sharey=True)
+    for ax, (task, methods) in zip(axes, tasks.items(), strict=True):
+        for style, name in enumerate(names):
+            draw_line(ax, [run.success for run in methods[name]], style, name)
+        ax.set(xlabel="epoch", title=task)
+        ax.grid(alpha=0.3)
+    axes[0].set(ylabel="test success rate", ylim=(-0.03, 1.03))
+    lines = {line.get_label(): line for line in axes[-1].lines if line.get_label() in names}
+    y = -1
+    for name in sorted(names, key=lambda name: lines[name].get_ydata()[-1]):
+        y = max(y + 0.13, lines[name].get_ydata()[-1])
+        place = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": 9}
+        axes[-1].annotate(
+            name.removeprefix("VCP, "), (1.03, y), color=lines[name].get_color(), **place
+        )
+    return fig
+
+
+def priority_figure(runs: list[Run]) -> Figure:
+    """What Eq. (4), over B_h and within each kind, is ahead of uniform priority in the mean success
+    of the epochs that both have: a point a seed, with the mean and its interval."""
+    arms = defaultdict(lambda: defaultdict(list))
+    for run in runs:
+        if run.config.method == "vcp":
+            rest = label(replace(run.config, priority="consistency")).removeprefix("VCP")
+            task = f"{run.config.env}, {schedule(run.config)}{rest}".replace(" of ", "\nof ", 1)
+            arms[task.removesuffix(", ")][run.config.priority].append(run)
+    arms = {task: found for task, found in arms.items() if {"uniform", "consistency"} <= set(found)}
+    if not arms:
+        raise LookupError
+    fig = Figure(figsize=(8.3, 0.6 * len(arms) + 1), layout="constrained")
+    ax = fig.subplots()
+    words = {"consistency": "Eq. (4)", "within-kind": "Eq. (4) within each kind"}
+    for style, (priority, text) in enumerate(words.items()):
+        how = {"color": COLOURS[style], "label": text}
+        for y, found in enumerate(arms.values()):
+            compared = [
+                [run.success[: min(len(a.success), len(b.success))].mean() for run in (a, b)]
+                for a, b in pairs(found[priority], found["uniform"])
+            ]
+            if compared:
+                ahead = np.subtract(*np.transpose(compared))
+                place = np.full(len(ahead), y + 0.3 * style - 0.15)
+                ax.plot(ahead, place, "os"[style], alpha=0.5, markersize=5, **how)
+                ends = interval(ahead)
+                ax.plot(ends or ahead.mean(), place[: 2 if ends else 1], "-|", color=how["color"])
+                how.pop("label", None)
+    ax.axvline(0, color="0.5", linewidth=1)
+    ax.set_yticks(range(len(arms)), arms, fontsize=8)
+    ax.set(xlabel="mean success, ahead of uniform priority", ylim=(len(arms) - 0.5, -0.5))
+    ax.grid(axis="x", alpha=0.3)
+    fig.legend(loc="outside upper center", ncols=2)
+    return fig
+
+
 # ------------------------------------------------------------------------------ the program
 
-NAMES = [*sorted([*FIGURES, *didactic.DRAWN]), "summary"]
+OURS = {"overview": overview, "priority": priority_figure}
+NAMES = [*sorted([*FIGURES, *didactic.DRAWN]), *OURS, "summary"]
 
 
 def draw(name: str, results: Path = RESULTS) -> Path:
@@ -309,12 +376,17 @@ def draw(name: str, results: Path = RESULTS) -> Path:
     runs = read_runs(results)
     labels = {label(run.config) for run in runs}
     compared = labels.intersection(FIGURES[name][1]) if name in FIGURES else labels
+    missing = f"figures.py: {name} compares runs that are not in {results}"
     if len(compared) < (2 if name in ("fig6", "fig7", "fig9") else 1):
-        sys.exit(f"figures.py: {name} compares runs that are not in {results}")
+        sys.exit(missing)
     runs = [run for run in runs if label(run.config) in compared]
     if name == "summary":
         return summary(runs, results)
-    paper_figure(name, runs).savefig(path, dpi=100)
+    try:
+        figure = OURS[name](runs) if name in OURS else paper_figure(name, runs)
+    except LookupError:
+        sys.exit(missing)
+    figure.savefig(path, dpi=100)
     return path
 
 

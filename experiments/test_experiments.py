@@ -152,6 +152,25 @@ def test_the_summary(results):
     assert "heads_at_once" not in (results / "Reacher-v2" / "README.md").read_text()  # stopped
 
 
+def test_what_the_priority_is_worth(tmp_path):
+    """A point is the difference of a seed's two runs over the epochs that both have."""
+    for priority, level, epochs in (
+        ("consistency", 0.5, 6),
+        ("uniform", 0.4, 7),
+        ("within-kind", 0.3, 6),
+    ):
+        for seed in range(2):
+            given = {"env": "FetchReach-v1", "seed": seed, "priority": priority}
+            make_run(tmp_path / priority / str(seed), epochs, level, **given)
+    make_run(tmp_path / "alone", env="Reacher-v2")
+    ax = figures.priority_figure(figures.read_runs(tmp_path)).axes[0]
+    points = [line.get_xdata() for line in ax.lines if line.get_marker() in ("o", "s")]
+    np.testing.assert_allclose(points, [[0.07, 0.07], [-0.07, -0.07]])
+    assert [text.get_text() for text in ax.get_yticklabels()] == ["FetchReach-v1"]
+    with pytest.raises(SystemExit, match="overview compares runs that are not in"):
+        figures.draw("overview", tmp_path)
+
+
 def test_every_table_in_results_is_generated():
     """And is that of the runs that are there: make it again and compare."""
     tables = figures.tables(figures.by_task(figures.read_runs(figures.RESULTS)))
