@@ -38,3 +38,16 @@ def test_a_buffer_too_small_for_what_is_collected_is_refused():
     for size, message in ((49, "50 or more"), (799, "hold 16 episodes of 50 steps")):
         with pytest.raises(UsageError, match=message):
             assemble(complete(Config(env="PointMassEmptyEnv-v1", buffer_size=size)))
+
+
+@pytest.mark.parametrize(
+    ("heads", "workers", "halves"), [(2, 1, 1), (2, 2, 2), (1, 2, 2), (3, 2, 1), (4, 4, 2)]
+)
+def test_each_half_has_the_environments_of_whole_heads_or_of_the_only_one(heads, workers, halves):
+    config = {**SMALL, "heads": heads, "num_workers": workers}
+    parts = assemble(complete(Config(**config, epochs=1)))
+    policy = run.acting_heads(parts.agent, heads, parts.num_envs)
+    with parts.envs() as envs:
+        assert (envs.num_workers, len(envs.halves)) == (workers, halves)
+        envs.reset(0)
+        run.rollout(envs, policy, 2)
