@@ -62,7 +62,7 @@ class MultiHeadMLP:
         """Head k's network, (B, I) -> (B, J), or those of some heads, each for rows of its own,
         (n, B, I) -> (n, B, J). frozen: without gradients for their parameters."""
         own = self.own[k]
-        if isinstance(k, slice):
+        if isinstance(k, slice):  # not self.stacks[k]: the gradients are those of the views
             own = [torch.stack(p) for p in zip(*own, strict=True)]
         params = [*self.trunk, *own]
         return self._forward([p.detach() for p in params] if frozen else params, x)
@@ -75,7 +75,7 @@ class MultiHeadMLP:
 
     def _forward(self, params: list[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
         w1, b1, w2, b2, w3, b3, w4, b4 = params
-        h = linear(x, w1, b1).relu_()  # in place: at this size a fresh array costs as much as it
+        h = linear(x, w1, b1).relu_()  # in place: a fresh array would cost as much as the ReLU
         h = linear(h, w2, b2).relu_()  # the embedding of Figure 1(a)
         h = linear(h, w3, b3).relu_()
         return self.squash(linear(h, w4, b4))
@@ -115,7 +115,7 @@ class Normalizer:
 
     def load_state_dict(self, state: dict) -> None:
         self.count = state["count"]
-        self.sum, self.sum_of_squares = (x.numpy() for x in state["sums"])
+        self.sum, self.sum_of_squares = (x.numpy().copy() for x in state["sums"])
         self._follow()
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
@@ -126,7 +126,7 @@ class EnsembleDDPG:
     """DDPG with K heads, Section 4.1: head k has its own actor, critic, target actor and target
     critic, and is trained on mini-batches of its own (Algorithm 2, lines 14-17).
 
-    All methods take and return NumPy arrays; actions are in [-1, 1].
+    Observations, goals, actions and values are NumPy arrays; actions are in [-1, 1].
     gamma: discount (the paper does not say; 1 - 1/T for episodes of T steps).
     polyak: share of the old target kept in `update_targets` (Appendix B: 0.95).
     action_penalty: weight of mean(μ²) in the actor's loss (not in the paper; 1 in HER's code).
@@ -170,8 +170,8 @@ class EnsembleDDPG:
     @torch.no_grad()
     def act(self, obs: np.ndarray, goal: np.ndarray, heads: slice = slice(None)) -> np.ndarray:
         """Algorithm 2, line 7, without noise: a = μ_k(s, g) for all heads in one call.
-        obs (K, E, O) and goal (K, E, G) -> (K, E, A); `heads` picks which K heads act. ValueError
-        for rows of another number of heads."""
+        obs (K, E, O) and goal (K, E, G) -> (K, E, A); `heads` picks those that act, K of them.
+        ValueError for rows of another number of heads."""
         acting = len(range(self.num_heads)[heads])
         if not (np.ndim(obs) == np.ndim(goal) == 3 and len(obs) == len(goal) == acting):
             shapes = f"obs is {np.shape(obs)} and goal {np.shape(goal)}"
@@ -291,7 +291,7 @@ class EnsembleDDPG:
             torch._foreach_lerp_(target.stacks, net.stacks, head_step)
 
     def state_dict(self) -> dict:
-        """Networks, targets, the optimiser's moments and the normaliser, as tensors."""
+        """Networks, targets, the optimiser's moments and the normaliser, as tensors, not copies."""
         return {
             "networks": [[p.detach() for p in net.trunk + net.stacks] for net in self._networks],
             "optimizer": self.optimizer.state_dict(),
@@ -304,7 +304,7 @@ class EnsembleDDPG:
         for net, saved in zip(self._networks, state["networks"], strict=True):
             for p, value in zip(net.trunk + net.stacks, saved, strict=True):
                 p.copy_(value)
-        self.optimizer.load_state_dict(state["optimizer"])
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))  # it keeps what it gets
         self.normalizer.load_state_dict(state["normalizer"])
 
     def _tensor(self, x: np.ndarray) -> torch.Tensor:

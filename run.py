@@ -43,14 +43,15 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     resume: go on with the run in config.out, after its last whole epoch. Everything random follows
     from (seed, epoch), so the rows are those of a run that was never stopped.
     UsageError, before anything is written, for a config that cannot be run; FloatingPointError
-    where NaN or Inf turns up; EnvironmentFailed for what an environment does wrong later.
+    where NaN or Inf turns up; EnvironmentFailed for what an environment does wrong later, and
+    ChildProcessError for a worker process that dies.
     """
     config = complete(config)
     folder = Path(config.out).absolute()  # an environment may change the working folder
     parts = assemble(config)  # 1: the off-policy algorithm 𝔸, B_o and B_h
     task, agent, replay = parts.task, parts.agent, parts.replay
     original_buffer, her_buffer = parts.original_buffer, parts.her_buffer
-    vcp = config.method == "vcp"  # the others have no B_h, and a replay of their own
+    vcp = config.method == "vcp"  # then replay is B_h; others have no B_h and a replay of their own
     num_envs, horizon = parts.num_envs, task.horizon
     acting = config.heads if config.acting_head == "all" else 1  # Section 5.6
     noise_shape = (horizon, num_envs, task.action_dim)
@@ -65,7 +66,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
         # for the products of Algorithm 1 and of the heads
         ThreadPoolExecutor(parts.threads(), initializer=numerics.begin_thread) as pool,
     ):
-        # a single head would only queue behind what is scored
+        # heads in turn stay in this thread: in the pool they would wait behind what is scored
         map_heads = pool.map if config.heads_at_once > 1 else map
         rows = records.begin(folder, asdict(config), parts.state(), resume)
         began -= rows[-1]["wall_seconds"] if rows else 0
@@ -145,27 +146,28 @@ def rollout(envs: ParallelEnvs, policy: Policy, horizon: int) -> tuple[dict, np.
     episodes, success = envs.empty_episodes(horizon), np.empty(envs.num_envs, bool)
     for half in envs.halves:
         half.reset()  # 5: goals and initial states
-    for t in range(horizon + 1):  # 6: T steps
+    for t in range(horizon + 1):  # 6: T steps, and what the last one leads to
         for half in envs.halves:  # while one acts, the other's environments step
-            n = half.which
-            seen, success[n] = half.wait()
-            episodes["obs"][n, t] = seen["observation"]
-            episodes["achieved_goal"][n, t] = seen["achieved_goal"]
-            episodes["desired_goal"][n] = seen["desired_goal"]
+            which = half.which
+            observed, success[which] = half.wait()
+            episodes["obs"][which, t] = observed["observation"]  # s_t
+            episodes["achieved_goal"][which, t] = observed["achieved_goal"]
+            episodes["desired_goal"][which] = observed["desired_goal"]
             if t < horizon:
-                # 7: a_t
-                action = policy(t, n, episodes["obs"][n, t], episodes["desired_goal"][n])
+                obs, goal = episodes["obs"][which, t], episodes["desired_goal"][which]
+                action = policy(t, which, obs, goal)  # 7: a_t
                 if not np.isfinite(action).all():
                     raise FloatingPointError("NaN or Inf in the actions, so in the networks")
-                episodes["action"][n, t] = action
-                # 8: s_{t+1}; Eq. (1) gives r_t when it is needed
-                half.step(episodes["action"][n, t])
+                episodes["action"][which, t] = action
+                # 8: on the way to s_{t+1}; Eq. (1) gives r_t when it is needed
+                half.step(episodes["action"][which, t])
     return episodes, success
 
 
 def acting_heads(agent: EnsembleDDPG, acting: int, num_envs: int, drawn=None) -> Policy:
     """π_k(s_t, g) of the first `acting` heads, which share the environments evenly: μ_k and what
-    `exploration` has drawn, or μ_k alone."""
+    `exploration` has drawn, or μ_k alone. It is asked for environments of whole heads, or for some
+    of the only head's."""
 
     def policy(t: int, which: slice, obs: np.ndarray, goal: np.ndarray) -> np.ndarray:
         first, end = which.start * acting // num_envs, math.ceil(which.stop * acting / num_envs)
@@ -180,16 +182,16 @@ def acting_heads(agent: EnsembleDDPG, acting: int, num_envs: int, drawn=None) ->
 
 
 def exploration(rng: np.random.Generator, shape: tuple, noise: float, at_random: float) -> tuple:
-    """HER's exploration, which is not in the paper: Gaussian noise of that standard deviation, and
-    some actions uniform instead, a share of `at_random`. It is drawn before the episodes, shape
-    (T, N, A), so that the number of workers does not change which environment gets what.
+    """HER's exploration, which is not in the paper: Gaussian noise of standard deviation `noise`,
+    and some actions uniform instead, a share of `at_random`. It is drawn before the episodes, of
+    shape (T, N, A), so that the number of workers does not change which environment gets what.
     Returns the noise, the uniform actions and where these are taken."""
     gaussian, uniform = noise * rng.standard_normal(shape), rng.uniform(-1, 1, shape)
     return gaussian, uniform, rng.random((*shape[:2], 1)) < at_random
 
 
 def by_head(x: np.ndarray, heads: int) -> np.ndarray:
-    """(N, ..., D) -> (heads, -1, D): the first N/heads environments are head 0's, and so on."""
+    """(N, ..., D) -> (heads, -1, D): the first N/heads rows are the first head's, and so on."""
     return x.reshape(heads, -1, x.shape[-1])
 
 

@@ -1,8 +1,8 @@
 """Value Consistency Prioritization, Section 4: what VCP adds to HER with an ensemble.
 
-`value_consistency_priority` is Eq. (4), `HERBuffer` is B_h with its priorities, and
-`update_her_buffer` is the body of Algorithm 1, of which `score` is lines 3-5. These are the method;
-the rest is DDPG and HER.
+`value_consistency_priority` is Eq. (4) with checks, `normalised_priority` without; `HERBuffer` is
+B_h with its priorities, and `update_her_buffer` is the body of Algorithm 1, of which `score` is
+lines 3-5. These are the method; the rest is DDPG and HER.
 
 Letters in the shape comments:
     N transitions in B_h    B transitions of a mini-batch
@@ -54,7 +54,7 @@ def priority_within_kinds(variance, hindsight, temperature: float):
     p = 0 * variance
     for kind in (hindsight, ~hindsight):
         if kind.any():
-            share = kind.sum() / len(kind)
+            share = float(kind.sum()) / len(kind)
             p[kind] = share * normalised_priority(variance[kind], temperature)
     return p
 
@@ -154,11 +154,14 @@ class HERBuffer:
         return {"rows": rows, "next": self._next}
 
     def load_state_dict(self, state: dict) -> None:
+        self.data, self.size, self._next = {}, 0, 0
+        if not state["rows"]:
+            return
         rows = dict(state["rows"])
         variance = rows.pop("variance")
-        self.data, self.size, self._next = {}, 0, 0
         self.add(rows, variance)
-        self._next = state["next"]
+        if self.size == self.capacity:
+            self._next = state["next"]
         self.update_priorities()
 
 

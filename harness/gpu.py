@@ -47,7 +47,7 @@ class HERBufferOnGPU(vcp.HERBuffer):
         self._drawn = []
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
-        """As `vcp.HERBuffer.sample`, as tensors; "hindsight" is 0 or 1."""
+        """As `vcp.HERBuffer.sample`, as tensors; "hindsight" is float32, 0 or 1."""
         if not len(self.probabilities):
             raise ValueError("B_h has no priorities: call update_priorities() after add()")
         if not self._drawn:
@@ -56,12 +56,11 @@ class HERBufferOnGPU(vcp.HERBuffer):
             batch = {name: x[i] for name, x in self.data.items()}
             batch["hindsight"] = batch["hindsight"].float()
             weight = self._importance(self.probabilities[i])
-            kind = batch["hindsight"] if self.within_kind else torch.zeros_like(weight)
-            sums = [
-                (weight * k).sum(-1, keepdim=True) / k.sum(-1, keepdim=True)
-                for k in (kind, 1 - kind)
-            ]
-            batch["weight"] = (weight / torch.where(kind == 1, *sums)).float()
+            if self.within_kind:
+                kinds = [k.double() for k in (batch["hindsight"], 1 - batch["hindsight"])]
+                means = [(weight * k).sum(-1, True) / k.sum(-1, True) for k in kinds]
+                weight = weight / torch.where(kinds[0] == 1, *means)
+            batch["weight"] = (weight / weight.mean(-1, keepdim=True)).float()
             self._drawn = [{n: x[j] for n, x in batch.items()} for j in range(self.at_once)]
         return self._drawn.pop(0)
 
@@ -80,9 +79,10 @@ class EnsembleOnGPU(EnsembleDDPG):
         self._begin()
 
     def _begin(self) -> None:
-        """What is captured or copied is not any more that of the networks or the optimiser."""
+        """Forget the captured graph and what the player copied: both are of other weights."""
         self._steps, self._followed = 0, None
         self._graph = None
+        # loading replaces it
         self.optimizer.param_groups[0]["capturable"] = self.device.type == "cuda"
 
     def load_state_dict(self, state: dict) -> None:
@@ -107,8 +107,9 @@ class EnsembleOnGPU(EnsembleDDPG):
         return self._player.act(obs, goal, heads)
 
     def update_heads(self, heads: Sequence[int], batches: list[Batch], map=map) -> torch.Tensor:
+        """As `EnsembleDDPG.update_heads`. All heads are one pass, which needs no `map`."""
         self._steps += 1
-        if [*heads] != [*range(self.num_heads)]:
+        if [*heads] != [*range(self.num_heads)] or len(batches) != len(heads):
             return super().update_heads(heads, batches)
         rows = {
             name: torch.stack([torch.as_tensor(batch[name]) for batch in batches])

@@ -15,7 +15,7 @@ from harness.records import MAY_CHANGE
 from vcp import IMPORTANCE, PRIORITIES
 
 METHODS = ["vcp", "her", "herebp", "cher", "dtgsh"]
-GROUPS = {  # of --help, by the first setting of each
+GROUPS = {  # headings of --help, each by the first setting below it
     "env": "the run",
     "epochs": "Appendix B: schedule, HER and DDPG",
     "heads": "Section 4: VCP",
@@ -33,8 +33,8 @@ def setting(default: Any, text: str, choices: Iterable[str] | None = None, **lim
 
 @dataclass
 class Config:
-    """Every setting of a run. NOTES.md says which of them the paper gives, and where. Where the
-    default is None, `complete` fills it in."""
+    """Every setting of a run. NOTES.md says which of them the paper gives, and where. A default of
+    None is filled in, by `complete` or where the run's parts are made."""
 
     env: str = setting("FetchReach-v1", "the paper's name, a goal environment's id, or module:ID")
     seed: int = setting(0, "the run's random numbers follow from it", least=0, most=2**32 - 1)
@@ -130,8 +130,8 @@ def scored_a_sweep(config: Config) -> int:
 
 
 def complete(config: Config) -> Config:
-    """A copy with schedule, capacity, device and folder filled in. UsageError for a setting of the
-    wrong type, out of range, or of another method."""
+    """A copy with schedule, heads at once, capacity of B_h, device and folder filled in. UsageError
+    for a setting of the wrong type, out of range, or of another method."""
     given = {name: value for name, value in asdict(config).items() if value is not None}
     for f in fields(Config):
         if f.name in given:
@@ -191,12 +191,9 @@ def differences(config: Config) -> dict[str, Any]:
     """The settings of a complete Config that its environment and method alone would not give, but
     for the seed and what may change when it is resumed."""
     default = complete(Config(env=config.env, method=config.method, out=""))
-    # These two follow from others where they are not given.
     follows = complete(replace(config, heads_at_once=None, her_buffer_capacity=None, out=""))
-    default.heads_at_once, default.her_buffer_capacity = (
-        follows.heads_at_once,
-        follows.her_buffer_capacity,
-    )
+    for name in ("heads_at_once", "her_buffer_capacity"):  # which follow from other settings
+        setattr(default, name, getattr(follows, name))
     names = [f.name for f in fields(Config) if f.name not in ("seed", *MAY_CHANGE)]
     pairs = {name: (getattr(config, name), getattr(default, name)) for name in names}
     return {name: value for name, (value, usual) in pairs.items() if value != usual}
@@ -218,6 +215,7 @@ def load(folder: Path) -> Config:
     """The settings of the run in `folder`. UsageError if it holds none, or another version's."""
     try:
         saved = records.read_config(folder)
+        # settings that are gone, and whose False changed nothing
         older = {name for name in ("faithful", "tensorboard") if saved.get(name) is False}
         return Config(**{name: value for name, value in saved.items() if name not in older})
     except (TypeError, AttributeError) as error:

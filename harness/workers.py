@@ -1,13 +1,15 @@
 """Environments side by side: gymnasium's vector environments, several to a worker process.
 
 One process for each environment pays for a message and a wake-up at every step of each; with 16
-environments on two cores that is a third of the time. So a worker holds a group of them.
+environments on two cores that is a third of the time. So a worker holds a group of them. The
+workers form two halves, of which one steps while the networks act for the other.
 """
 
 import os
 import signal
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from functools import partial
 from multiprocessing import connection
 from types import SimpleNamespace
@@ -99,7 +101,7 @@ class EnvGroup(gym.Env):
 
 
 class Here(SyncVectorEnv):
-    """An AsyncVectorEnv without processes, whose answers are there when they are asked for."""
+    """Environments in this process, asked as an AsyncVectorEnv is: `..._async` does the work."""
 
     processes = ()
 
@@ -116,8 +118,9 @@ class Here(SyncVectorEnv):
 
 
 class Half:
-    """The environments `which` of all, shared evenly by processes or, with `here`, in this one.
-    `reset` and `step` begin, `wait` waits, so that meanwhile the networks act for another half."""
+    """Half of the environments or, without halves, all: those of the slice `which`, shared evenly
+    by processes or, with `here`, in this one. `reset` and `step` begin and `wait` waits, so that
+    meanwhile the networks act for the other half."""
 
     def __init__(self, name: str, make: MakeEnv, which: slice, num_workers: int, here: bool):
         self.name, self.which, self.size = name, which, (which.stop - which.start) // num_workers
@@ -133,32 +136,30 @@ class Half:
         without, it goes on with the random numbers it has."""
         first = range(self.which.start, self.which.stop, self.size)
         seeds = None if seed is None else [seed + i for i in first]
-        self._answer = self._env.reset_wait
+        self._finish = self._env.reset_wait
         self._ask(self._env.reset_async, seed=seeds)
 
     def step(self, action: np.ndarray) -> None:
         """One step in each: actions (n, A) in [-1, 1]."""
-        self._answer = self._env.step_wait
+        self._finish = self._env.step_wait
         self._ask(self._env.step_async, action.reshape(-1, self.size, action.shape[-1]))
 
     def wait(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Observations, float32 arrays of (n, ...) that hold until the next step, and is_success
         (n,), False after `reset`."""
-        obs, *_, info = self._ask(self._answer)
+        obs, *_, info = self._ask(self._finish)
         obs = {name: x.reshape(-1, x.shape[-1]) for name, x in obs.items()}
         return obs, info["is_success"].reshape(-1)
 
     def close(self, now: bool) -> None:
-        """now: without waiting for a step that may be under way, of whose answer a part may have
-        been read already."""
-        try:
-            for process in self._env.processes if now else ():
-                process.terminate()
-                process.join()
-            if not now or not self._env.processes:
+        """End the processes. now: in whatever step they are, of whose answer a part may have been
+        read already."""
+        with suppress(EOFError, ConnectionError):  # of a process that is dead already
+            if not (now and self._env.processes):
                 self._env.close()
-        except (EOFError, ConnectionError):  # the process is dead, so there is nothing to close
-            pass
+        for process in self._env.processes:  # those that have not ended
+            process.terminate()
+            process.join()
         self._env.closed = True
 
     def _ask(self, method, *args, **kwargs):
@@ -170,7 +171,7 @@ class Half:
             dead = [p for p in self._env.processes if p.sentinel in ended]
             for process in dead:
                 process.join()
-            codes = ", ".join(str(process.exitcode) for process in dead)
+            codes = ", ".join(str(process.exitcode) for process in dead) or "unknown"
             raise ChildProcessError(
                 f"a worker process of {self.name} died (exit code {codes})"
             ) from error
@@ -180,27 +181,32 @@ class ParallelEnvs:
     """num_envs environments of `make_env(name, **settings)` in num_workers processes, the same
     number in each; use it in a `with`. With one worker there is no other process.
 
-    in_halves: the workers are two halves (an even number of workers), which take turns: while the
-    environments of one step, the networks act for the other.
+    in_halves: the workers, an even number, form two halves. While one half's environments step, the
+    networks act for the other's.
     """
 
     def __init__(
         self, name: str, num_envs: int, num_workers: int, in_halves: bool = False, **settings
     ):
         self.num_envs, self.num_workers = num_envs, num_workers
-        if num_envs % num_workers:
-            raise ValueError(f"{num_workers} workers cannot share {num_envs} environments evenly")
+        parts = 2 if in_halves else 1
+        if num_envs % num_workers or num_workers % parts:
+            shared = f"{num_envs} environments evenly" + " in two halves" * in_halves
+            raise ValueError(f"{num_workers} workers cannot share {shared}")
         # gymnasium would print the traceback of what a worker raises; it is raised here as well.
         self._logged, gym.logger.min_level = gym.logger.min_level, 50
         # A process that is not forked does not know what the user's own script has registered.
         spec = gym.registry.get(PAPER_ENVS.get(name, name).rpartition(":")[2])
         make = partial(make_env, name, spec=spec, **settings)
-        n = 2 if in_halves else 1
-        envs, workers = num_envs // n, num_workers // n
-        self.halves = [
-            Half(name, make, slice(i * envs, (i + 1) * envs), workers, here=num_workers == 1)
-            for i in range(n)
-        ]
+        envs, workers = num_envs // parts, num_workers // parts
+        self.halves: list[Half] = []
+        try:
+            for i in range(parts):
+                which = slice(i * envs, (i + 1) * envs)
+                self.halves.append(Half(name, make, which, workers, here=num_workers == 1))
+        except BaseException:
+            self.close(now=True)
+            raise
 
     def empty_episodes(self, horizon: int) -> dict[str, np.ndarray]:
         """Room for an episode of each environment: the arrays of her.EpisodeBuffer."""
@@ -230,9 +236,10 @@ class ParallelEnvs:
 
     def close(self, now: bool = False) -> None:
         """End the environments and their processes; now: in whatever step they are."""
-        for half in self.halves:
-            half.close(now)
-        gym.logger.min_level = self._logged
+        with ExitStack() as stack:  # all of it, also where one half raises
+            stack.callback(setattr, gym.logger, "min_level", self._logged)
+            for half in self.halves:
+                stack.callback(half.close, now)
 
 
 def number_of_workers(asked: int | None, num_envs: int) -> int:
