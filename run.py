@@ -2,11 +2,11 @@
 
     python run.py --env FetchReach-v1
 
-`train` is the algorithm. Where a line of the box begins, its number stands at the end of the line
-of code; `+` marks what is not in the box, and says where it is from. HER+ is HER's published code,
-VCP+ the authors' (NOTES.md, "Hyper-parameters"). Algorithm 1 is in vcp.py. What is set up before
-comes from harness/assemble.py; what is noted goes to harness/epoch.py, what is kept to
-harness/records.py.
+`train` is the algorithm. Where a line of the box begins, a comment at the end of the code or above
+it has the number of that line; `+` marks what is not in the box, and the comment says where it is
+from. HER+ is HER's published code, VCP+ the authors' (NOTES.md, "Hyper-parameters"). Algorithm 1 is
+in vcp.py. What is set up before comes from harness/assemble.py; what is noted goes to
+harness/epoch.py, what is kept to harness/records.py.
 
 Letters in the shape comments:
     K heads    N environments, n of them    T steps of an episode    O observation    G goal

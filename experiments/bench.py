@@ -2,7 +2,8 @@
 
 Absolute times depend on the machine and on what else it does, so each figure is printed beside a
 yardstick that was measured in turn with it: the matrix products of an update alone, the raw
-environment, the same sweep without scoring, one core. Medians, with the quartiles behind them.
+environment, the same sweep without scoring, one core. Parts 1 and 2 print medians with the
+quartiles behind them.
 """
 
 import argparse

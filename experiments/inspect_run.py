@@ -1,12 +1,12 @@
-"""Look into the last checkpoint of runs: python -m experiments.inspect_run WHAT DIR...
+"""Look into the checkpoints of runs: python -m experiments.inspect_run WHAT DIR...
 
 WHAT is one of
     effective    how much Eq. (4) prefers, at the paper's temperatures: the effective sample size of
                  B_h, 1 / Σ p², as a share of its transitions (100 % is uniform), and the share of
                  originals among the draws
     replayed     what each method would draw from the run's B_o: the share of originals, and of
-                 transitions whose goal is still ahead (r = -1). In a task with an object the
-                 others are mostly at their goal because nothing has touched it
+                 transitions whose goal is still ahead (r = -1). In a task with an object most
+                 others are at their goal because nothing has touched the object
     dead         the share of the networks' hidden units that are 0 for all of 4,096 transitions,
                  and learn no more
 """

@@ -10,7 +10,7 @@ and broken ones resumed, so the same command goes on where it was stopped.
     python -m experiments.sweep --plan experiments/paper.txt
 
 trains the runs of a file, whose lines are such arguments, one after the other in its order, without
-Ray. Started several times, on machines that share the folder, each takes the next that is free.
+Ray. Several such commands, on machines that share the folder, each take the next run that is free.
 """
 
 import argparse

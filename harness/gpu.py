@@ -1,9 +1,10 @@
 """What a GPU needs beside the code of ensemble.py and vcp.py: the same numbers, but for rounding.
 
-A GPU is fast at large calls, and slow to ask. So B_h lies on it; heads that step together are
-trained in one pass, whose few hundred calls are captured once, as a CUDA graph, and then asked for
-as one; and acting, which is many small calls, stays on the CPU. The two classes stand for those
-that they are made from, and are called in the same way; `assemble` takes them for `--device cuda`.
+A GPU computes a large call fast, and every call costs time. So B_h lies on the GPU; heads that step
+together are trained in one pass, whose few hundred calls are captured once, as a CUDA graph, and
+then made as one; and acting, which is many small calls, stays on the CPU. With `--device cuda`
+`assemble` takes the two classes here in place of those that they inherit from; they are called in
+the same way.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,8 +1,8 @@
 """The folder of a run: config.json (what was asked), progress.csv (a row an epoch), curve.png and
 checkpoint.pt (all that is needed to go on).
 
-Each file is written beside its place and moved there when it is whole, so whatever happens, what
-stands in the folder is whole: the last epoch's or the one before.
+Each file is written beside its place and moved there when it is whole, so whatever happens, each
+file in the folder is whole: it is the last epoch's or that of the epoch before.
 """
 
 import csv

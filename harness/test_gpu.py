@@ -1,5 +1,5 @@
-"""Tests of what a GPU needs, on the CPU, and on a GPU where there is one: against the classes that
-these stand for."""
+"""Tests of what a GPU needs, on the CPU and, where there is one, on a GPU: each class of
+harness/gpu.py is compared with the one that it replaces."""
 
 import itertools
 from copy import deepcopy

@@ -1,8 +1,8 @@
 """Environments side by side: gymnasium's vector environments, several to a worker process.
 
-One process for each environment pays for a message and a wake-up at every step of each; with 16
-environments on two cores that is a third of the time. So a worker holds a group of them. The
-workers form two halves, of which one steps while the networks act for the other.
+With a process for each environment, every step of each costs a message and a wake-up; with 16
+environments on two cores these take a third of the time. So a worker holds a group of environments.
+The workers form two halves, of which one steps while the networks act for the other.
 """
 
 import os
