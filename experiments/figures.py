@@ -123,8 +123,9 @@ def said(x: np.ndarray, sign: str = "") -> str:
     if len(x) == 1:
         return number(x[0])
     ends = interval(x)
-    spread = " to ".join(map(number, ends)) if ends else " ".join(map(number, x))
-    return f"{number(x.mean())} ({spread})"
+    if ends:
+        return f"{number(x.mean())} ±{(ends[1] - ends[0]) / 2:.3f}"
+    return f"{number(x.mean())} ({' '.join(map(number, x))})"
 
 
 def pairs(ours: list[Run], theirs: list[Run]) -> list[tuple[Run, Run]]:

@@ -205,8 +205,8 @@ def test_statistics_by_hand():
     # 0.1, 0.2 ... 0.5: mean 0.3, standard deviation 0.1581, standard error 0.0707
     low, high = figures.interval(np.arange(1, 6) / 10)
     np.testing.assert_allclose([low, high], [0.3 - 2.776 * 0.070711, 0.3 + 2.776 * 0.070711], 1e-5)
-    assert figures.said(np.arange(1, 6) / 10) == "0.300 (0.104 to 0.496)"
-    assert figures.said(np.arange(1, 6) / -10, "+") == "-0.300 (-0.496 to -0.104)"
+    assert figures.said(np.arange(1, 6) / 10) == "0.300 ±0.196"
+    assert figures.said(np.arange(1, 6) / -10, "+") == "-0.300 ±0.196"
     assert figures.interval(np.ones((4, 2))) is None  # too few: the seeds themselves
     assert figures.said(np.array([0.2496, -0.0004]), "+") == "+0.125 (+0.250 +0.000)"  # rounded
     assert figures.said(np.array([0.9996])) == "1.000"
