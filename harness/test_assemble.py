@@ -38,3 +38,9 @@ def test_a_buffer_too_small_for_what_is_collected_is_refused():
     for size, message in ((49, "50 or more"), (799, "hold 16 episodes of 50 steps")):
         with pytest.raises(UsageError, match=message):
             assemble(complete(Config(env="PointMassEmptyEnv-v1", buffer_size=size)))
+
+
+def test_the_line_of_the_environment_says_which_action_penalty_is_not_hers():
+    for given, said in ((None, False), (1.0, False), (0.1, True)):
+        config = complete(Config(env="PointMassEmptyEnv-v1", action_penalty=given))
+        assert ("action penalty 0.1 (1 is HER's" in assemble(config).task.made) == said
