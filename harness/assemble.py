@@ -121,6 +121,9 @@ def assemble(config: Config) -> Parts:
     """All parts of a run, untrained. config: complete. UsageError for an environment that cannot be
     learned in, and for sizes that the memory does not hold."""
     task = examine(config.env, config.episode_length, partial(refuse_what_does_not_fit, config))
+    if config.action_penalty != 1:
+        penalty = f"action penalty {config.action_penalty:g} (1 is HER's, for the paper's tasks)"
+        task = replace(task, made=f"{task.made}; {penalty}")
     num_envs = number_of_envs(config)
     agent = make_agent(config, task)
     original_buffer = EpisodeBuffer(

@@ -51,3 +51,9 @@ def test_each_half_has_the_environments_of_whole_heads_or_of_the_only_one(heads,
         assert (envs.num_workers, len(envs.halves)) == (workers, halves)
         envs.reset(0)
         run.rollout(envs, policy, 2)
+
+
+def test_the_line_of_the_environment_says_which_action_penalty_is_not_hers():
+    for given, said in ((None, False), (1.0, False), (0.1, True)):
+        config = complete(Config(env="PointMassEmptyEnv-v1", action_penalty=given))
+        assert ("action penalty 0.1 (1 is HER's" in assemble(config).task.made) == said

@@ -16,10 +16,19 @@ def test_the_schedule_is_appendix_b():
     assert schedule.pop("FetchReach-v1")[:3] == (5, 5, 64)
     assert schedule.pop("Reacher-v2")[:3] == (15, 5, 64)
     assert {s[:3] for s in schedule.values()} == {(50, 40, 256)}
-    c = Config()
+    c = settings.complete(Config())
     assert (c.heads, c.epochs, c.eval_episodes, c.buffer_size) == (16, 50, 160, 1_000_000)
     assert (c.relabel_ratio, c.learning_rate, c.polyak) == (0.8, 1e-3, 0.95)
     assert (c.noise, c.random_actions, c.action_penalty, c.temperature) == (0.2, 0.3, 1.0, 9.0)
+
+
+def test_the_papers_tasks_have_hers_action_penalty_and_others_a_tenth():
+    paper = [*PAPER_ENVS, *PAPER_ENVS.values()]
+    assert {settings.complete(Config(env=env)).action_penalty for env in paper} == {1.0}
+    for env in ("line:Line-v0", "gymnasium_robotics:PointMaze_UMaze-v3"):
+        assert settings.complete(Config(env=env)).action_penalty == 0.1
+        assert settings.complete(Config(env=env, action_penalty=1)).action_penalty == 1.0
+        assert settings.variant(settings.complete(Config(env=env))) == "vcp"
 
 
 @pytest.mark.parametrize(
