@@ -38,7 +38,7 @@ def test_the_papers_sixteen(name):
         ("FetchSilce-v1", "FetchSlide-v4", 50),  # as Appendix A misprints them
         ("FetchPickAndPlac-v1", "FetchPickAndPlace-v4", 50),
         ("FetchPush-v4", "FetchPush-v4", 50),
-        ("HandManipulateEggFull-v1", "HandManipulateEggFull-v1", 100),  # its own length
+        ("HandManipulateEggFull-v1", "HandManipulateEggFull-v1", 100),  # the length of today
     ],
 )
 def test_other_names(name, today, steps):

@@ -31,7 +31,7 @@ def test_workers_play_the_same_as_one_process(name, sizes):
             np.testing.assert_allclose(other, array, atol=1e-4)
             if key != "action":
                 np.testing.assert_array_equal(other[:, 0], array[:, 0])
-        assert len({row.tobytes() for row in array}) == 4  # each environment has its own seed
+        assert len({row.tobytes() for row in array}) == 4  # no two have one seed
         assert array.dtype == np.float32
 
 

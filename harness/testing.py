@@ -295,8 +295,8 @@ def start(*arguments, program=None, module=None, script=HERE / "run.py", limit=N
 
 
 def wait_for_an_epoch(process, folder):
-    """Until the first is whole, its picture too: what a signal raises in an import, as that of
-    matplotlib, its C code may turn into an ImportError or lose."""
+    """Until the first is whole, with curve.png: an import such as matplotlib's may lose
+    what a signal raises, or make an ImportError of it."""
     while not (folder / "curve.png").exists() and process.poll() is None:
         time.sleep(0.05)
 
