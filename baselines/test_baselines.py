@@ -67,15 +67,21 @@ def test_vcp_without_prioritization_samples_like_her():
         np.testing.assert_allclose(batch["weight"], 1, rtol=1e-6)
 
 
-def test_what_was_drawn_without_new_episodes_is_dropped():
-    """New episodes would be replayed late, or mini-batches that were drawn at once be the same."""
+@pytest.mark.parametrize(
+    "method",
+    [HERReplay, partial(HEREBP, dt=DT), partial(CHER, heads=1, updates=1), DTGSH],
+)
+def test_what_was_drawn_without_new_episodes_is_dropped(method):
+    """New episodes would be replayed late or never, or the mini-batches of one draw be the same."""
     buffer, rng = EpisodeBuffer(20, 5, 2, 2, 2, 0.8, exact_reward), np.random.default_rng(0)
-    her = HERReplay(buffer, at_once=4)
-    her.new_episodes(buffer.add(numbered_episodes(1, 5), rng))
-    assert not her.sample(100, rng)["obs"][:, 0].any()
-    assert len({her.sample(100, rng)["obs"].tobytes() for _ in range(6)}) == 6
-    her.new_episodes(buffer.add(numbered_episodes(3, 5), rng))
-    assert set(her.sample(100, rng)["obs"][:, 0]) == {0, 10, 20}
+    task = {} if method is HERReplay else {"env_name": "PointMassEmptyEnv-v1"}
+    replay = method(buffer, at_once=4, **task)
+    replay.new_episodes(buffer.add(numbered_episodes(1, 5), rng))
+    assert not replay.sample(100, rng)["obs"][:, 0].any()
+    assert len({replay.sample(100, rng)["obs"].tobytes() for _ in range(6)}) == 6
+    replay.new_episodes(buffer.add(numbered_episodes(3, 5), rng))
+    assert replay.sample(100, rng)["obs"][:, 0].max() == 20  # of the newest
+    assert replay.size == 4 * 100 == len(replay.data["obs"])
 
 
 # ---------------------------------------------------------------------------------------- HEREBP
@@ -332,23 +338,40 @@ def test_where_nothing_moves_all_episodes_are_alike(method):
 
 
 @pytest.mark.parametrize(
-    ("env_name", "sigma", "most_diversity", "most_energy", "goal_part"),
+    ("env_name", "sigma", "most_diversity", "most_energy"),
     [
-        ("FetchPush-v1", 0.5, 0.001, 0.5, slice(0, None)),
-        ("HandReach-v0", 0.1, math.inf, 2.5, slice(0, None)),
-        ("HandManipulateEggRotate-v0", 0.1, math.inf, 2.5, slice(3, None)),
-        ("Reacher-v2", 0.5, math.inf, math.inf, slice(0, None)),
+        ("FetchPush-v1", 0.5, 0.001, 0.5),
+        ("HandReach-v0", 0.1, math.inf, 2.5),
+        ("Reacher-v2", 0.5, math.inf, math.inf),
     ],
 )
-def test_settings_are_the_originals(env_name, sigma, most_diversity, most_energy, goal_part):
-    """A method would be compared with other settings than those of the original's authors, or
-    look at the place of an object that is to be rotated."""
-    buffer = stored(np.ones((1, 6, 7)))
-    dtgsh = DTGSH(buffer, env_name=env_name)
-    assert (dtgsh.sigma, dtgsh.most, dtgsh.goal_part) == (sigma, most_diversity, goal_part)
-    herebp = HEREBP(buffer, env_name=env_name, dt=DT)
-    assert (herebp.settings, herebp.exponent) == ((DT, most_energy), 1 / 1.01)
-    assert CHER(buffer, env_name=env_name, heads=1, updates=1).goal_part == goal_part
+def test_settings_are_the_originals(env_name, sigma, most_diversity, most_energy):
+    """A method would be compared with other settings than those of the original's authors."""
+    buffer = stored(np.float32(np.random.default_rng(0).normal(size=(4, 6, 3))))
+    achieved = buffer.episodes["achieved_goal"]
+    dtgsh, herebp = DTGSH(buffer, env_name=env_name), HEREBP(buffer, env_name=env_name, dt=DT)
+    for replay in (dtgsh, herebp):
+        replay.new_episodes(np.arange(4))
+    assert (dtgsh.sigma, herebp.exponent) == (sigma, 1 / 1.01)
+    np.testing.assert_allclose(dtgsh.diversity, trajectory_diversity(achieved, most_diversity))
+    np.testing.assert_allclose(herebp.energy, trajectory_energy(achieved, DT, most_energy))
+
+
+@pytest.mark.parametrize("method", [partial(CHER, heads=1, updates=1), DTGSH])
+@pytest.mark.parametrize(
+    ("env_name", "alone"),
+    [("HandManipulateEggRotate-v0", True), ("HandManipulateEggFull-v0", False)],
+)
+def test_rotation_tasks_look_at_the_orientation_alone(method, env_name, alone):
+    """The place of an object, which a rotation task does not ask for, would count."""
+    achieved = np.float32(np.random.default_rng(0).normal(size=(4, 6, 7)))
+    obs = []
+    for scale in (1, 5):
+        achieved[..., :3] *= scale
+        replay = method(stored(achieved), env_name=env_name)
+        replay.new_episodes(np.arange(4))
+        obs.append(drawn(replay, 16, 4)["obs"])
+    assert np.array_equal(*obs) == alone
 
 
 # ---------------------------------------------------------------------------------------- runs

@@ -169,6 +169,8 @@ def spied_run(**changes):
                 assert moved.wait(timeout=60)
                 moved.clear()
             result = function(*args, **kwargs)
+            if key == "rollout":  # a run this short reaches no goal: one in the second, and so on
+                result = result[0], np.arange(16) < len(calls[key])
             if key == "update" and 3 in args[1]:
                 moved.set()
             thread = threading.current_thread()
