@@ -340,8 +340,10 @@ def test_the_environments_own_word_says_what_succeeded():
     assert reward == -1 and info["is_success"] is True
 
 
-def test_what_cannot_be_made_in_a_worker_is_said_before_anything_is_written(tmp_path, capfd):
-    """As where a port or a licence is taken."""
+def test_what_cannot_be_made_in_a_worker_is_said_before_anything_is_written(
+    tmp_path, capfd, monkeypatch
+):
+    """As where a port or a licence is taken, or there can be no more processes."""
     main_process = os.getpid()
 
     def init(self, render_mode=None):
@@ -351,11 +353,14 @@ def test_what_cannot_be_made_in_a_worker_is_said_before_anything_is_written(tmp_
     code, _, err = ended(capfd, *arguments(odd(__init__=init), tmp_path / "run", workers=2))
     assert code == 2 and "could not be started" in err and "Traceback" not in err
     assert "the port is taken" in err and not (tmp_path / "run").exists()
+    monkeypatch.setattr("harness.assemble.ParallelEnvs", raising(OSError("no process left")))
+    code, _, err = ended(capfd, *arguments(PLAIN, tmp_path / "run", workers=2))
+    assert code == 2 and "the run cannot be set up: OSError: no process left" in err
 
 
-@pytest.mark.parametrize(("low", "high"), [(-0.7, 0.3), (0.1, 0.7), (-1e-3, 3e7)])
+@pytest.mark.parametrize(("low", "high"), [(-0.7, 0.3), (-1, 0.7), (-1e-3, 3e7)])
 def test_actions_are_rescaled_to_the_bounds_and_do_not_leave_them_by_rounding(low, high):
-    box, taken = Box(np.array([low, -5]), np.array([high, 5]), dtype=np.float64), []
+    box, taken = Box(np.array([low, -1]), np.array([high, 9]), dtype=np.float64), []
 
     def step(self, action):
         taken.append(action)
@@ -366,7 +371,7 @@ def test_actions_are_rescaled_to_the_bounds_and_do_not_leave_them_by_rounding(lo
     for action in ([-1, -1], [0.3, 0], [1, 1]):
         env.step(np.float32(action))
         assert box.contains(np.float64(taken[-1]))
-    part = (np.array(taken) - [low, -5]) / [high - low, 10]
+    part = (np.array(taken) - [low, -1]) / [high - low, 10]
     np.testing.assert_allclose(part, [[0, 0], [0.65, 0.5], [1, 1]], atol=1e-6)
 
 

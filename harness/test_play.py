@@ -3,6 +3,7 @@
 import itertools
 import json
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -54,7 +55,8 @@ def test_a_policy_acts_as_the_best_head_and_plays_without_the_run(
     assert about == {**expected, "epoch": 4}
     rows = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 1, 20, 2))
     np.testing.assert_allclose(policy.act(*rows), agent.act(*rows, slice(1, 2)), atol=1e-5)
-    rates = play(file)
+    monkeypatch.chdir(tmp_path)
+    rates = play(Path("policy.npz"))
     out = capsys.readouterr().out
     assert "over 10 episodes" in out and f"--play {file} --gif" in out and "by head" not in out
     assert np.array_equal(rates, play(whole)[[1]])

@@ -64,7 +64,7 @@ def test_what_is_said_of_a_task(name, made, dt, capfd):
     ("name", "message"),
     [
         ("FetchReach-v9", "the nearest names are .*FetchReach-v4"),
-        ("FetchRaech-v1", "the nearest names are .*FetchReach-v1"),
+        ("PointMasWallEnv-v1", "the nearest names are .*PointMassWallEnv-v1"),
         ("FetchReach-v2", "FetchReach-v4"),  # deprecated
         ("no_such_module:Env-v0", "no_such_module"),
         ("", "cannot make"),

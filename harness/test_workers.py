@@ -25,7 +25,10 @@ def test_workers_play_the_same_as_one_process(name, sizes):
             assert envs.num_workers == workers
             envs.reset(7)
             noise = run.exploration(np.random.default_rng(0), (5, 4, sizes[2]), 0.2, 0.3)
-            played.append(run.rollout(envs, run.acting_heads(agent, 2, 4, noise), 5)[0])
+            episodes, success = run.rollout(envs, run.acting_heads(agent, 2, 4, noise), 5)
+        apart = np.linalg.norm(episodes["achieved_goal"][:, -1] - episodes["desired_goal"], axis=1)
+        np.testing.assert_array_equal(success, apart < 0.05)
+        played.append(episodes)
     for key, array in played[0].items():
         for other in (played[1][key], played[2][key]):
             np.testing.assert_allclose(other, array, atol=1e-4)
@@ -41,8 +44,9 @@ def test_as_many_workers_as_cores_share_the_environments_evenly(monkeypatch):
     for cores, made in ((1, 1), (2, 2), (3, 2), (16, 16), (64, 16)):
         monkeypatch.setattr("harness.workers.available_cores", lambda n=cores: [*range(n)])
         assert number_of_workers(None, 16) == made
-    with pytest.raises(ValueError, match="4 workers cannot share 18"):
-        ParallelEnvs(POINTS, 18, 4)
+    for num_workers, in_halves in ((4, False), (3, True)):
+        with pytest.raises(ValueError, match=f"{num_workers} workers cannot share 18"):
+            ParallelEnvs(POINTS, 18, num_workers, in_halves)
 
 
 def test_one_half_acts_while_the_other_steps(monkeypatch):
@@ -71,7 +75,9 @@ def test_one_half_acts_while_the_other_steps(monkeypatch):
     assert events == 4 * turn + [("wait", 0), ("wait", 3)]
 
 
-def test_a_process_ends_though_half_of_its_answer_has_been_read():
+def test_a_process_ends_though_half_of_its_answer_has_been_read(monkeypatch):
+    handlers = []  # of this process: a worker that ignores Ctrl-C notes that in a copy
+    monkeypatch.setattr(signal, "signal", lambda *args: handlers.append(args))
     with pytest.raises(ZeroDivisionError), ParallelEnvs(POINTS, 4, 2) as envs:
         envs.reset(0)
         vector = envs.halves[0]._env
@@ -79,7 +85,7 @@ def test_a_process_ends_though_half_of_its_answer_has_been_read():
         vector.step_async(np.zeros((2, 2, 2)))
         assert len(os.read(pipe.fileno(), 4)) == 4  # the answer's length
         raise ZeroDivisionError
-    assert not process.is_alive()
+    assert not process.is_alive() and not handlers
 
 
 @pytest.mark.parametrize("name", ["FetchPush-v1", "HandReach-v0", "HandManipulateEggFull-v0"])
