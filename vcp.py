@@ -71,7 +71,7 @@ def mean_one_within_kinds(weight: np.ndarray, hindsight: np.ndarray) -> np.ndarr
 PRIORITIES = {  # of the rows that B_h holds: the method, Section 5.6's two ablations, and ours
     "consistency": lambda rows, t: normalised_priority(rows["variance"], t),
     "variance": lambda rows, t: normalised_priority(-rows["variance"], t),
-    "uniform": lambda rows, t: normalised_priority(rows["variance"], 0),
+    "uniform": lambda rows, t: 0 * rows["variance"] + 1 / len(rows["variance"]),
     "within-kind": lambda rows, t: priority_within_kinds(rows["variance"], rows["hindsight"], t),
 }
 
