@@ -87,7 +87,7 @@ class Normalizer:
 
     def __init__(self, dim: int, device="cpu"):
         self.count = 0
-        self.sum, self.sum_of_squares = np.zeros((2, dim))  # float64: over millions of rows
+        self.sums = torch.zeros(2, dim, dtype=torch.float64)  # of x and x²: over millions of rows
         self.mean = torch.zeros(dim, device=device)
         self.std = torch.ones(dim, device=device)
 
@@ -95,28 +95,18 @@ class Normalizer:
         """Add the rows of x, (B, dim), to the statistics."""
         x = np.clip(np.asarray(x, dtype=np.float64), -200, 200)
         self.count += len(x)
-        self.sum += x.sum(axis=0)
-        self.sum_of_squares += np.square(x).sum(axis=0)
-        self._follow()
-
-    def _follow(self) -> None:
-        if self.count == 0:  # of an agent that has seen nothing
-            self.mean.zero_()
-            self.std.fill_(1)
-            return
-        mean = self.sum / self.count
-        variance = self.sum_of_squares / self.count - mean**2
-        self.mean.copy_(torch.from_numpy(mean))
-        self.std.copy_(torch.from_numpy(np.sqrt(np.maximum(variance, 0.01**2))))
+        self.sums += torch.from_numpy(np.stack([x.sum(axis=0), np.square(x).sum(axis=0)]))
+        mean, mean_of_squares = self.sums / self.count
+        self.mean.copy_(mean)
+        self.std.copy_((mean_of_squares - mean**2).clamp(min=0.01**2).sqrt())
 
     def state_dict(self) -> dict:
-        sums = (torch.from_numpy(x) for x in (self.sum, self.sum_of_squares))
-        return {"count": self.count, "sums": tuple(sums)}
+        return {"count": self.count, "sums": self.sums, "mean": self.mean, "std": self.std}
 
     def load_state_dict(self, state: dict) -> None:
         self.count = state["count"]
-        self.sum, self.sum_of_squares = (x.numpy().copy() for x in state["sums"])
-        self._follow()
+        for name in ("sums", "mean", "std"):
+            getattr(self, name).copy_(state[name])
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         return ((x.clamp(-200, 200) - self.mean) / self.std).clamp(-5, 5)

@@ -73,62 +73,6 @@ class EpisodeBuffer:
         """Algorithm 1, lines 3-4: a mini-batch, its goals relabelled by `relabel_future`."""
         return relabel_future(self.episodes, batch_size, rng, self.relabel_ratio, self.reward_fn)
 
-    def state_dict(self) -> dict[str, np.ndarray]:
-        """What a checkpoint keeps of it: the stored episodes."""
-        return self.episodes
-
-    def load_state_dict(self, episodes: dict[str, np.ndarray]) -> None:
-        self.size = len(episodes["action"])
-        for name, array in self._data.items():
-            array[: self.size] = episodes[name]
-
-
-def future_goals(
-    episodes: dict[str, np.ndarray],
-    e: np.ndarray,
-    t: np.ndarray,
-    rng: np.random.Generator,
-    relabel_ratio: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Section 3.2: goals for the transitions t (B,) of the episodes e (B,). With probability
-    `relabel_ratio` one that was achieved later in the same episode, else the one it was played for.
-    Returns the goals (B, G) and which of them are hindsight's (B,) bool."""
-    horizon = episodes["action"].shape[1]
-    hindsight = rng.random(len(e)) < relabel_ratio
-    future = rng.integers(t + 1, horizon + 1)  # t' ~ U{t+1, ..., T}
-    achieved = episodes["achieved_goal"][e, future]
-    return np.where(hindsight[:, None], achieved, episodes["desired_goal"][e]), hindsight
-
-
-def transitions(
-    episodes: dict[str, np.ndarray],
-    e: np.ndarray,
-    t: np.ndarray,
-    goal: np.ndarray,
-    hindsight: np.ndarray,
-    reward_fn: RewardFn,
-) -> Batch:
-    """The transitions t (B,) of the episodes e (B,) with the goals (B, G) and their rewards.
-    Returns what `relabel_future` returns, and raises its errors."""
-    # r(s, a, g) asks whether the action led to the goal, so it reads the NEXT achieved goal.
-    reward = np.asarray(reward_fn(episodes["achieved_goal"][e, t + 1], goal), dtype=np.float32)
-    if reward.shape != e.shape:
-        raise ValueError(
-            f"reward_fn of {goal.shape} goals gave {reward.shape}, not {e.shape} rewards"
-        )
-    if not np.isfinite(reward).all():
-        raise FloatingPointError("NaN or Inf in the rewards")
-    if reward.max(initial=-1) > 0 or reward.min(initial=0) < -1:
-        raise ValueError(f"reward_fn gave {reward.min()} to {reward.max()}, not Eq. (1)'s -1 and 0")
-    return {
-        "obs": episodes["obs"][e, t],
-        "action": episodes["action"][e, t],
-        "next_obs": episodes["obs"][e, t + 1],  # with the same goal as obs
-        "goal": goal,
-        "reward": reward,
-        "hindsight": hindsight,
-    }
-
 
 def relabel_future(
     episodes: dict[str, np.ndarray],
@@ -151,5 +95,37 @@ def relabel_future(
     n, horizon = episodes["action"].shape[:2]
     e = rng.integers(n, size=batch_size)
     t = rng.integers(horizon, size=batch_size)  # 0 .. T-1
-    goal, hindsight = future_goals(episodes, e, t, rng, relabel_ratio)
-    return transitions(episodes, e, t, goal, hindsight, reward_fn)
+    return relabelled(episodes, e, t, rng, relabel_ratio, reward_fn)
+
+
+def relabelled(
+    episodes: dict[str, np.ndarray],
+    e: np.ndarray,
+    t: np.ndarray,
+    rng: np.random.Generator,
+    relabel_ratio: float,
+    reward_fn: RewardFn,
+) -> Batch:
+    """`relabel_future` of given transitions: the steps t (B,) of the episodes e (B,)."""
+    achieved, horizon = episodes["achieved_goal"], episodes["action"].shape[1]
+    hindsight = rng.random(len(e)) < relabel_ratio
+    future = rng.integers(t + 1, horizon + 1)  # t' ~ U{t+1, ..., T}
+    goal = np.where(hindsight[:, None], achieved[e, future], episodes["desired_goal"][e])
+    # r(s, a, g) asks whether the action led to the goal, so it reads the NEXT achieved goal.
+    reward = np.asarray(reward_fn(achieved[e, t + 1], goal), dtype=np.float32)
+    if reward.shape != e.shape:
+        raise ValueError(
+            f"reward_fn of {goal.shape} goals gave {reward.shape}, not {e.shape} rewards"
+        )
+    if not np.isfinite(reward).all():
+        raise FloatingPointError("NaN or Inf in the rewards")
+    if reward.max(initial=-1) > 0 or reward.min(initial=0) < -1:
+        raise ValueError(f"reward_fn gave {reward.min()} to {reward.max()}, not Eq. (1)'s -1 and 0")
+    return {
+        "obs": episodes["obs"][e, t],
+        "action": episodes["action"][e, t],
+        "next_obs": episodes["obs"][e, t + 1],  # with the same goal as obs
+        "goal": goal,
+        "reward": reward,
+        "hindsight": hindsight,
+    }

@@ -68,7 +68,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
     ):
         # heads in turn stay in this thread: in the pool they would wait behind what is scored
         map_heads = pool.map if config.heads_at_once > 1 else map
-        rows = records.begin(folder, asdict(config), parts.state(), resume)
+        rows = records.begin(folder, asdict(config), parts, resume)
         began -= rows[-1]["wall_seconds"] if rows else 0
         print(task.made)
         for number in range(len(rows) + 1, config.epochs + 1):  # 2: M epochs

@@ -155,14 +155,11 @@ class HERBuffer:
 
     def load_state_dict(self, state: dict) -> None:
         self.data, self.size, self._next = {}, 0, 0
-        if not state["rows"]:
-            return
-        rows = dict(state["rows"])
-        variance = rows.pop("variance")
-        self.add(rows, variance)
-        if self.size == self.capacity:
+        if state["rows"]:
+            rows = dict(state["rows"])
+            self.add(rows, rows.pop("variance"))
             self._next = state["next"]
-        self.update_priorities()
+            self.update_priorities()
 
 
 def score(

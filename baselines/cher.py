@@ -11,7 +11,7 @@ Letters in the shape comments:
 import numpy as np
 
 from baselines.her import HERReplay
-from her import Batch, EpisodeBuffer, future_goals, transitions
+from her import Batch, EpisodeBuffer, relabelled
 
 GROWTH = 1e-4  # of λ, with each update
 TRIO = 3  # candidates that are looked at for one to be taken
@@ -102,7 +102,8 @@ class CHER(HERReplay):
         n, horizon = episodes["action"].shape[:2]
         e = rng.integers(n, size=count * candidates)
         t = rng.integers(horizon, size=count * candidates)
-        goal, hindsight = future_goals(episodes, e, t, rng, self.buffer.relabel_ratio)
+        ratio, reward_fn = self.buffer.relabel_ratio, self.buffer.reward_fn
+        batch = relabelled(episodes, e, t, rng, ratio, reward_fn)
 
         def by_batch(x):
             return x[:, self.goal_part].reshape(count, candidates, -1)
@@ -111,6 +112,6 @@ class CHER(HERReplay):
         self.drawn += count
         achieved = by_batch(episodes["achieved_goal"][e, t])
         proximity = (1 + GROWTH) ** tau
-        chosen = select(by_batch(goal), achieved, batch_size, proximity, rng)
+        chosen = select(by_batch(batch["goal"]), achieved, batch_size, proximity, rng)
         i = (chosen + candidates * np.arange(count)[:, None]).reshape(-1)
-        return transitions(episodes, e[i], t[i], goal[i], hindsight[i], self.buffer.reward_fn)
+        return {name: x[i] for name, x in batch.items()}

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from baselines.her import HERReplay
-from her import Batch, EpisodeBuffer, future_goals, transitions
+from her import Batch, EpisodeBuffer, relabelled
 
 CANDIDATES = 100 / 64  # for each that is selected
 SMALLEST = 1e-12  # an eigenvalue's share of the largest; below it is rounding
@@ -122,12 +122,12 @@ class DTGSH(HERReplay):
         t = rng.integers(episodes["action"].shape[1], size=count * candidates)
         # As many original goals among the candidates as there are in a mini-batch of HER.
         relabel_ratio = 1 - batch_size * (1 - self.buffer.relabel_ratio) / candidates
-        goal, hindsight = future_goals(episodes, e, t, rng, relabel_ratio)
+        batch = relabelled(episodes, e, t, rng, relabel_ratio, self.buffer.reward_fn)
 
-        g = goal[:, self.goal_part].reshape(count, candidates, -1).astype(np.float64)
+        g = batch["goal"][:, self.goal_part].reshape(count, candidates, -1).astype(np.float64)
         square = np.square(g).sum(axis=-1)  # |g_i - g_j|² = |g_i|² + |g_j|² - 2 g_i·g_j
         distance2 = square[:, :, None] + square[:, None] - 2 * g @ g.transpose(0, 2, 1)
         kernel = np.exp(-np.maximum(distance2, 0) / (2 * self.sigma**2))
         items = sample_k_dpp(kernel, batch_size, rng)
         i = (items + candidates * np.arange(count)[:, None]).reshape(-1)
-        return transitions(episodes, e[i], t[i], goal[i], hindsight[i], self.buffer.reward_fn)
+        return {name: x[i] for name, x in batch.items()}

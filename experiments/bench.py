@@ -22,7 +22,7 @@ import torch
 import run
 from ensemble import HIDDEN, EnsembleDDPG
 from harness.assemble import make_replay
-from harness.numerics import begin_thread, fast_products, one_thread
+from harness.numerics import begin_thread, for_training
 from harness.settings import Config, complete, variant
 from harness.tasks import examine, make_env
 from harness.workers import ParallelEnvs, available_cores, number_of_workers
@@ -225,8 +225,7 @@ def bench_paper(cycles: int) -> None:
         )
 
 
-@one_thread()
-@fast_products()
+@for_training()
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--quick", action="store_true", help="1 to 3, with fewer repeats")

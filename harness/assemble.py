@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from baselines import cher, dtgsh, herebp
 from baselines.her import HERReplay
 from ensemble import HIDDEN, PART, EnsembleDDPG
@@ -58,9 +60,17 @@ class Parts:
     her_buffer: HERBuffer | None  # B_h; another method has none
     replay: HERBuffer | HERReplay  # what line 15 draws from: B_h, or another method's
 
-    def state(self) -> tuple:
+    def state(self) -> dict:
         """What a checkpoint keeps."""
-        return self.agent, self.original_buffer, self.replay
+        episodes = self.original_buffer.episodes
+        agent, replay = self.agent.state_dict(), self.replay.state_dict()
+        return {"agent": agent, "episodes": episodes, "replay": replay}
+
+    def load_state(self, state: dict) -> None:
+        """Take over a `state`; B_o must be empty."""
+        self.agent.load_state_dict(state["agent"])
+        self.original_buffer.add(state["episodes"], np.random.default_rng())  # none makes room
+        self.replay.load_state_dict(state["replay"])
 
     def threads(self) -> int:
         """How many compute beside each other. Heads that take turns are trained in the main thread,
@@ -189,7 +199,7 @@ def restored(folder: Path) -> tuple[Parts, list[dict]]:
     of a run from a GPU. UsageError if there is none."""
     config = replace(settings.load(folder), device="cpu")
     parts = assemble(settings.complete(config))
-    rows = records.restore(folder, asdict(parts.config), parts.state())
+    rows = records.restore(folder, asdict(parts.config), parts)
     if not rows and (epochs := records.epochs_done(folder)):
         raise UsageError(
             f"{folder} has {epochs} epochs in progress.csv and no {records.CHECKPOINT}"

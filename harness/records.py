@@ -45,7 +45,7 @@ COLUMNS = [
 TIMING_COLUMNS = {name for name in COLUMNS if name.endswith("_seconds")}
 PACKAGES = ("numpy", "torch", "gymnasium", "gymnasium-robotics", "mujoco")
 CHECKPOINT = "checkpoint.pt"
-FORMAT = 6  # of checkpoints; others are refused
+FORMAT = 7  # of checkpoints; others are refused
 MAY_CHANGE = ("epochs", "out", "device", "threads", "num_workers")  # when a run is resumed
 
 
@@ -105,10 +105,10 @@ def held(folder: Path, resume: bool) -> Iterator[None]:
         lock.release()
 
 
-def begin(folder: Path, config: dict, parts: tuple, resume: bool) -> list[dict]:
-    """The rows so far: none or, with `resume`, those of the checkpoint, to whose state the parts
-    are brought. A finished run's config.json keeps the commit and versions that made it. UsageError
-    as in `restore`."""
+def begin(folder: Path, config: dict, parts, resume: bool) -> list[dict]:
+    """The rows so far: none or, with `resume`, those of the checkpoint, to whose state the
+    assemble.Parts are brought. A finished run's config.json keeps the commit and versions that made
+    it. UsageError as in `restore`."""
     rows = restore(folder, config, parts) if resume else []
     if len(rows) < config["epochs"]:
         write_config(folder, config)
@@ -121,13 +121,12 @@ def _refuse_another(folder: Path, resume: bool) -> None:
         raise UsageError(f"{folder} already holds a run: --resume it, or choose another --out")
 
 
-def save(folder: Path, config: dict, rows: list[dict], parts: tuple) -> None:
-    """The end of an epoch: checkpoint.pt, then progress.csv and curve.png. FloatingPointError, and
-    nothing written, for NaN or Inf in the networks."""
-    states = as_tensors([part.state_dict() for part in parts])
-    if not all(p.isfinite().all() for net in states[0]["networks"] for p in net):
+def save(folder: Path, config: dict, rows: list[dict], state: dict) -> None:
+    """The end of an epoch: checkpoint.pt, then progress.csv and curve.png. state: assemble.Parts'.
+    FloatingPointError, and nothing written, for NaN or Inf in the networks."""
+    if not all(p.isfinite().all() for net in state["agent"]["networks"] for p in net):
         raise FloatingPointError("NaN or Inf in the networks")
-    save_checkpoint(folder, {"config": config, "rows": rows, "parts": states})
+    save_checkpoint(folder, {"config": config, "rows": rows, "state": as_tensors(state)})
     write_rows(folder, rows, config)
 
 
@@ -189,10 +188,10 @@ def read_checkpoint(path: Path) -> dict:
     return saved
 
 
-def restore(folder: Path, config: dict, parts: tuple) -> list[dict]:
-    """Bring the parts to the state of the checkpoint. Returns its rows, none if there is none yet.
-    UsageError for a damaged one, and for one of another version or of other settings than `config`,
-    those aside that a resumed run may change."""
+def restore(folder: Path, config: dict, parts) -> list[dict]:
+    """Bring the assemble.Parts to the state of the checkpoint. Returns its rows, none if there is
+    none yet. UsageError for a damaged one, and for one of another version or of other settings than
+    `config`, those aside that a resumed run may change."""
     path = folder / CHECKPOINT
     if not path.exists():
         return []
@@ -201,11 +200,10 @@ def restore(folder: Path, config: dict, parts: tuple) -> list[dict]:
         differ = [k for k, v in saved["config"].items() if k not in MAY_CHANGE and config[k] != v]
         if differ:
             raise UsageError(f"{path} was made with another {differ[0]} than config.json says")
-        if _sizes(saved["parts"]) != _sizes([part.state_dict() for part in parts]):
+        if _sizes(saved["state"]) != _sizes(parts.state()):
             changed = "networks or episodes of other sizes, as if the environment had changed"
             raise UsageError(f"{path} has {changed}")
-        for part, state in zip(parts, saved["parts"], strict=True):
-            part.load_state_dict(state)
+        parts.load_state(saved["state"])
     except UsageError:
         raise
     except Exception as error:  # whatever a damaged file leads to
@@ -213,11 +211,10 @@ def restore(folder: Path, config: dict, parts: tuple) -> list[dict]:
     return saved["rows"]
 
 
-def _sizes(states: list[dict]) -> list:
+def _sizes(state: dict) -> list:
     """The shapes of an agent's tensors and of an episode of B_o."""
-    agent, original_buffer, *_ = states
-    shapes = [p.shape for network in agent["networks"] for p in network]
-    return shapes + [x.shape[1:] for x in original_buffer.values()]
+    shapes = [p.shape for network in state["agent"]["networks"] for p in network]
+    return shapes + [x.shape[1:] for x in state["episodes"].values()]
 
 
 def _draw_curve(folder: Path, rows: list[dict], config: dict) -> None:

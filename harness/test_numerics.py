@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from harness.numerics import begin_thread, fast_products, one_thread, small_calls
+from harness.numerics import begin_thread, denormals_are_zero, for_training, small_calls
 from harness.testing import HERE, SMALL_TRAINING
 
 
@@ -17,15 +17,15 @@ def test_fast_products_are_float32_or_left_alone(call, monkeypatch):
     setting, x, w = torch.backends.mkldnn.matmul, torch.randn(256, 300), torch.randn(300, 256)
     before, threads = setting.fp32_precision, torch.get_num_threads()
     torch.set_num_threads(2)
-    with pytest.raises(KeyError), fast_products(), one_thread():
-        assert torch.get_num_threads() == 1
+    with pytest.raises(KeyError), for_training():
+        assert torch.get_num_threads() == 1 and denormals_are_zero()
         assert (x @ w - x.double() @ w.double()).abs().max() < 1e-4
         inside = setting.fp32_precision
         with small_calls():
             assert setting.fp32_precision == "ieee"
         assert setting.fp32_precision == inside
         raise KeyError
-    assert torch.get_num_threads() == 2
+    assert torch.get_num_threads() == 2 and not denormals_are_zero()
     torch.set_num_threads(threads)
     assert setting.fp32_precision == before
 
@@ -35,7 +35,7 @@ def test_fast_products_are_float32_or_left_alone(call, monkeypatch):
         return exact(*(t.bfloat16().float() for t in tensors))
 
     monkeypatch.setattr(torch, call, rounded)  # a processor that rounds
-    with fast_products():
+    with for_training():
         assert setting.fp32_precision == before
 
 

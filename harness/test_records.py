@@ -189,14 +189,14 @@ def test_a_flipped_bit_is_noticed(whole, tmp_path):
         place = offset + 128 + rng.randrange(size - 64)
         path.write_bytes(bytes_[:place] + bytes([bytes_[place] ^ 1]) + bytes_[place + 1 :])
         with pytest.raises(UsageError, match=r"checkpoint\.pt is damaged"):
-            records.restore(folder, config, parts.state())
+            records.restore(folder, config, parts)
 
 
 @pytest.mark.parametrize(
     ("what", "message"),
     [
         ("half", "damaged"),
-        ("parts", "damaged"),
+        ("replay", "damaged"),
         ("size", "has networks or episodes of other sizes"),
         ("foreign", "damaged"),
         ("pickle", "damaged"),
@@ -210,9 +210,9 @@ def test_a_checkpoint_that_is_not_this_runs_is_not_trained_on(
     shutil.copytree(whole, folder)
     path, ran = folder / records.CHECKPOINT, tmp_path / "ran"
     saved = records.read_checkpoint(path)
-    networks = saved["parts"][0]["networks"]
-    if what == "parts":
-        del saved["parts"][2]
+    networks = saved["state"]["agent"]["networks"]
+    if what == "replay":
+        del saved["state"]["replay"]
     elif what == "size":
         networks[1] = [p[..., :-1] for p in networks[1]]
     elif what == "foreign":

@@ -267,7 +267,7 @@ def assert_same_run(a, b):
         return [state]
 
     assert without_timing(a) == without_timing(b)
-    first, second = (leaves(read_checkpoint(f / "checkpoint.pt")["parts"]) for f in (a, b))
+    first, second = (leaves(read_checkpoint(f / "checkpoint.pt")["state"]) for f in (a, b))
     assert len(first) == len(second) > 100
     for x, y in zip(first, second, strict=True):
         assert torch.equal(x, y) if isinstance(x, torch.Tensor) else x == y
