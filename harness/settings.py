@@ -87,7 +87,7 @@ class Config:
 
     device: str = setting(
         "auto",
-        "where the networks are; auto: a GPU if any, and if all heads step together",
+        "where the networks are; auto: a GPU if any, for many updates of all heads at once",
         ["auto", "cpu", "cuda"],
     )
     threads: int | None = setting(
@@ -98,6 +98,7 @@ class Config:
     )
 
 
+FEW = 5  # updates a cycle
 OF_VCP = ("temperature", "priority", "importance", "scored_per_drawn", "her_buffer_capacity")
 
 
@@ -125,7 +126,7 @@ def heads_at_once(updates: int, heads: int) -> int:
     """How many heads take a step together where it is not given (not in the paper). With few
     updates a cycle one, Algorithm 2 to the letter: the trunks take K steps, one with each head.
     With many, all, so that the trunks take one (NOTES.md, "Heads in turn or at once")."""
-    return 1 if updates <= 5 else heads
+    return 1 if updates <= FEW else heads
 
 
 def drawn_a_sweep(config: Config) -> int:
@@ -145,6 +146,8 @@ def complete(config: Config) -> Config:
     for f in fields(Config):
         if f.name in given:
             given[f.name] = checked(f, given[f.name])
+    if "env" in given:  # one name for an environment that is registered anyway
+        given["env"] = given["env"].removeprefix("gymnasium_robotics:")
     method = given.get("method", "vcp")
     config = Config(**{**paper_schedule(given.get("env", Config.env), method), **given})
     for name in OF_VCP if method != "vcp" else ():
@@ -169,8 +172,8 @@ def complete(config: Config) -> Config:
         raise UsageError(f"--heads-at-once must divide the {config.heads} heads")
     if config.device == "auto":
         # Heads in turn are many small calls, which a GPU hardly makes faster (results/SPEED.md).
-        together = config.heads_at_once == config.heads
-        config.device = "cuda" if together and torch.cuda.is_available() else "cpu"
+        much = config.heads_at_once == config.heads and config.updates > FEW
+        config.device = "cuda" if much and torch.cuda.is_available() else "cpu"
     if config.device == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda: no CUDA device was found")
     if config.out is None:

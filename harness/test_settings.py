@@ -16,6 +16,7 @@ def test_the_schedule_is_appendix_b():
     assert schedule.pop("FetchReach-v1")[:3] == (5, 5, 64)
     assert schedule.pop("Reacher-v2")[:3] == (15, 5, 64)
     assert {s[:3] for s in schedule.values()} == {(50, 40, 256)}
+    assert settings.complete(Config(env="gymnasium_robotics:FetchReach-v4")).updates == 5
     c = settings.complete(Config())
     assert (c.heads, c.epochs, c.eval_episodes, c.buffer_size) == (16, 50, 160, 1_000_000)
     assert (c.relabel_ratio, c.learning_rate, c.polyak) == (0.8, 1e-3, 0.95)
@@ -23,7 +24,7 @@ def test_the_schedule_is_appendix_b():
 
 
 def test_the_papers_tasks_have_hers_action_penalty_and_others_a_tenth():
-    paper = [*PAPER_ENVS, *PAPER_ENVS.values()]
+    paper = [*PAPER_ENVS, *PAPER_ENVS.values(), "gymnasium_robotics:FetchPush-v4"]
     assert {settings.complete(Config(env=env)).action_penalty for env in paper} == {1.0}
     for env in ("line:Line-v0", "gymnasium_robotics:PointMaze_UMaze-v3"):
         assert settings.complete(Config(env=env)).action_penalty == 0.1
@@ -93,6 +94,7 @@ def test_a_missing_device_is_named():
         ({"env": "FetchPush-v1", "heads": 1, "method": "her"}, "cuda"),
         ({"env": "FetchPush-v1", "heads_at_once": 8}, "cpu"),
         ({"env": "FetchReach-v1"}, "cpu"),
+        ({"env": "FetchReach-v1", "heads": 1, "method": "her"}, "cpu"),
         ({"env": "FetchReach-v1", "device": "cuda"}, "cuda"),
         ({"env": "FetchPush-v1", "device": "cpu"}, "cpu"),
     ],
