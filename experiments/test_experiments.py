@@ -294,9 +294,10 @@ def test_the_share_of_originals_by_temperature():
     data = {"variance": variance, "hindsight": np.append(hindsight[:100], True)}
     beyond = {name: np.append(x, x[:7]) for name, x in data.items()}  # what B_h does not hold yet
     parts = SimpleNamespace(her_buffer=SimpleNamespace(size=101, data=beyond))
-    cells = [cell.split("; ")[1] for cell in inspect_run.effective(parts)]
+    cells = [cell.split("; ") for cell in inspect_run.effective(parts)]
     # 20 · 0.5^𝒯 / (20 · 0.5^𝒯 + 80)
-    assert cells == ["11.1%", "0.8%", "0.0%", "0.0%", "0.0%"]
+    assert [cell[2] for cell in cells] == ["11.1%", "0.8%", "0.0%", "0.0%", "0.0%"]
+    assert {cell[1] for cell in cells} == {"98.8%"}  # 80 of 81, all alike
 
 
 def test_what_each_method_replays(small_run, tmp_path, capsys):
