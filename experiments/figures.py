@@ -205,6 +205,8 @@ def panels_of(plan: str, methods: dict[str, list[Run]]) -> dict[str, Lines]:
 def summary(runs: list[Run], results: Path) -> Path:
     """Write the tables and the tasks' figures, without runs that were stopped before their last
     epoch."""
+    if not runs:
+        raise LookupError
     tasks = by_task([run for run in runs if len(run.success) >= run.config.epochs])
     panels = defaultdict(dict)
     for (folder, plan), methods in tasks.items():
@@ -283,7 +285,10 @@ def curves(panels: dict[str, Lines], title: str, what: str = "test success rate"
 
 def paper_figure(name: str, runs: list[Run]) -> Figure:
     """A panel for each task in which there is something to compare VCP with or, if there is none,
-    for each task; of Figure 4 for each."""
+    for each task; of Figure 4 for each. LookupError where nothing is compared."""
+    runs = [run for run in runs if label(run.config) in FIGURES[name][1]]
+    if len({label(run.config) for run in runs}) < (1 if name in ("fig2", "fig4") else 2):
+        raise LookupError
     tasks = {"\n".join(filter(None, task)): methods for task, methods in by_task(runs).items()}
     title = f"{FIGURES[name][0]}; Appendix B's schedule unless said"
     if name == "fig4":
@@ -297,33 +302,13 @@ def paper_figure(name: str, runs: list[Run]) -> Figure:
     return curves({task: success(m) for task, m in (compared or tasks).items()}, title)
 
 
-THREE_TASKS = ("FetchReach-v1", "FetchPush-v1", "HandReach-v0")
-
-
 def overview(runs: list[Run]) -> Figure:
-    """README's figure: four methods on three tasks, the lines labelled beside the last panel."""
+    """README's figure: four methods on three tasks. LookupError if one of them is missing."""
+    found = {task: dict(methods) for task, methods in by_task(runs).items()}
     names = ("VCP", "VCP, uniform priority", "HER, 16 heads", "HER")
-    found = by_task(runs)
-    tasks = {task: found.get((task, ""), {}) for task in THREE_TASKS}
-    if not all({*names} <= methods.keys() for methods in tasks.values()):
-        raise LookupError
-    fig = Figure(figsize=(8.3, 2.5), layout="constrained")
-    axes = fig.subplots(1, 3, sharey=True)
-    for ax, (task, methods) in zip(axes, tasks.items(), strict=True):
-        for style, name in enumerate(names):
-            draw_line(ax, [run.success for run in methods[name]], style, name)
-        ax.set(xlabel="epoch", title=task)
-        ax.grid(alpha=0.3)
-    axes[0].set(ylabel="test success rate", ylim=(-0.03, 1.03))
-    lines = {line.get_label(): line for line in axes[-1].lines if line.get_label() in names}
-    y = -1
-    for name in sorted(names, key=lambda name: lines[name].get_ydata()[-1]):
-        y = max(y + 0.13, lines[name].get_ydata()[-1])
-        place = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": 9}
-        axes[-1].annotate(
-            name.removeprefix("VCP, "), (1.03, y), color=lines[name].get_color(), **place
-        )
-    return fig
+    tasks = ("FetchReach-v1", "FetchPush-v1", "HandReach-v0")
+    panels = {task: success({name: found[task, ""][name] for name in names}) for task in tasks}
+    return curves(panels, "One network (HER), and three times the same 16 heads")
 
 
 def priority_figure(runs: list[Run]) -> Figure:
@@ -370,29 +355,23 @@ NAMES = [*sorted([*FIGURES, *didactic.DRAWN]), *OURS, "summary"]
 
 
 def draw(name: str, results: Path = RESULTS) -> Path:
-    """Write NAME.png, or the tables for "summary", into `results`, and give its path."""
-    path = results / f"{name}.png"
-    if name in didactic.DRAWN:
-        try:
-            didactic.DRAWN[name](results / "didactic").savefig(path, dpi=100)
-        except FileNotFoundError as error:
-            sys.exit(f"figures.py: {error.filename} is missing: experiments.didactic")
-        except ModuleNotFoundError as error:
-            sys.exit(f"figures.py: {name}: {error}: pip install -r requirements-experiments.txt")
-        return path
-    runs = read_runs(results)
-    labels = {label(run.config) for run in runs}
-    compared = labels.intersection(FIGURES[name][1]) if name in FIGURES else labels
-    missing = f"figures.py: {name} compares runs that are not in {results}"
-    if len(compared) < (2 if name in ("fig6", "fig7", "fig9") else 1):
-        sys.exit(missing)
-    runs = [run for run in runs if label(run.config) in compared]
-    if name == "summary":
-        return summary(runs, results)
+    """Write NAME.png, or the tables for "summary", into `results`, and give its path. SystemExit,
+    with what to do, if something for it is missing."""
     try:
-        figure = OURS[name](runs) if name in OURS else paper_figure(name, runs)
+        if name in didactic.DRAWN:
+            figure = didactic.DRAWN[name](results / "didactic")
+        elif name == "summary":
+            return summary(read_runs(results), results)
+        else:
+            runs = read_runs(results)
+            figure = OURS[name](runs) if name in OURS else paper_figure(name, runs)
+    except FileNotFoundError as error:
+        sys.exit(f"figures.py: {error.filename} is missing: experiments.didactic")
+    except ModuleNotFoundError as error:
+        sys.exit(f"figures.py: {name}: {error}: pip install -r requirements-experiments.txt")
     except LookupError:
-        sys.exit(missing)
+        sys.exit(f"figures.py: {name} compares runs that are not in {results}")
+    path = results / f"{name}.png"
     figure.savefig(path, dpi=100)
     return path
 
