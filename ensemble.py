@@ -87,7 +87,7 @@ class Normalizer:
 
     def __init__(self, dim: int, device="cpu"):
         self.count = 0
-        self.sums = torch.zeros(2, dim, dtype=torch.float64)  # of x and x²: over millions of rows
+        self.sums = torch.zeros(2, dim, dtype=torch.float64)  # of x and x², of millions of rows
         self.mean = torch.zeros(dim, device=device)
         self.std = torch.ones(dim, device=device)
 

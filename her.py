@@ -95,10 +95,10 @@ def relabel_future(
     n, horizon = episodes["action"].shape[:2]
     e = rng.integers(n, size=batch_size)
     t = rng.integers(horizon, size=batch_size)  # 0 .. T-1
-    return relabelled(episodes, e, t, rng, relabel_ratio, reward_fn)
+    return relabel_given(episodes, e, t, rng, relabel_ratio, reward_fn)
 
 
-def relabelled(
+def relabel_given(
     episodes: dict[str, np.ndarray],
     e: np.ndarray,
     t: np.ndarray,
@@ -106,7 +106,7 @@ def relabelled(
     relabel_ratio: float,
     reward_fn: RewardFn,
 ) -> Batch:
-    """`relabel_future` of given transitions: the steps t (B,) of the episodes e (B,)."""
+    """`relabel_future` for given transitions: the steps t (B,) of the episodes e (B,)."""
     achieved, horizon = episodes["achieved_goal"], episodes["action"].shape[1]
     hindsight = rng.random(len(e)) < relabel_ratio
     future = rng.integers(t + 1, horizon + 1)  # t' ~ U{t+1, ..., T}

@@ -158,7 +158,8 @@ class HERBuffer:
         if state["rows"]:
             rows = dict(state["rows"])
             self.add(rows, rows.pop("variance"))
-            self._next = state["next"]
+            if self.size == self.capacity:
+                self._next = state["next"]
             self.update_priorities()
 
 

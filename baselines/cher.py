@@ -11,7 +11,7 @@ Letters in the shape comments:
 import numpy as np
 
 from baselines.her import HERReplay
-from her import Batch, EpisodeBuffer, relabelled
+from her import Batch, EpisodeBuffer, relabel_given
 
 GROWTH = 1e-4  # of λ, with each update
 TRIO = 3  # candidates that are looked at for one to be taken
@@ -103,7 +103,7 @@ class CHER(HERReplay):
         e = rng.integers(n, size=count * candidates)
         t = rng.integers(horizon, size=count * candidates)
         ratio, reward_fn = self.buffer.relabel_ratio, self.buffer.reward_fn
-        batch = relabelled(episodes, e, t, rng, ratio, reward_fn)
+        batch = relabel_given(episodes, e, t, rng, ratio, reward_fn)
 
         def by_batch(x):
             return x[:, self.goal_part].reshape(count, candidates, -1)

@@ -10,7 +10,7 @@ Letters in the shape comments:
 import numpy as np
 
 from baselines.her import HERReplay
-from her import Batch, EpisodeBuffer, relabelled
+from her import Batch, EpisodeBuffer, relabel_given
 
 GRAVITY = 9.81  # m/s²; masses are 1 kg and moments of inertia 1 kg·m²
 MOST_PER_STEP = {"Fetch": 0.5, "Hand": 2.5}  # J; the original's README, by the environment's name
@@ -81,4 +81,4 @@ class HEREBP(HERReplay):
         # Inverse transform sampling: the first e with p_1 + ... + p_e > u.
         e = np.searchsorted(self.cumulative, rng.random(size), side="right")
         t = rng.integers(episodes["action"].shape[1], size=size)
-        return relabelled(episodes, e, t, rng, self.buffer.relabel_ratio, self.buffer.reward_fn)
+        return relabel_given(episodes, e, t, rng, self.buffer.relabel_ratio, self.buffer.reward_fn)

@@ -31,8 +31,8 @@ from vcp import score, update_her_buffer
 
 HEADS = 16
 SIZES = {"FetchReach-v1": (10, 3, 4), "FetchPush-v1": (25, 3, 4), "HandReach-v0": (63, 15, 20)}
-# Minutes of an epoch of HandReach: Table 2, by the number of heads, and Tables 1 and 3, one network
-# and 16 heads
+# The paper's minutes of an epoch of HandReach: VCP by the number of heads (Table 2), the other
+# methods with one network and with 16 heads (Tables 1 and 3)
 OF_HEADS = {16: 12.0, 2: 3.2, 4: 5.6, 8: 8.5, 32: 20.7}
 OF_OTHERS = {"her": (1.5, 9.3), "herebp": (2.74, 11.0), "cher": (8.2, 60.5), "dtgsh": (34.1, 253.0)}
 

@@ -32,6 +32,10 @@ END = "<!-- to here -->"
 Lines = dict[str, list[np.ndarray]]  # by label: a curve for each run
 
 
+class Missing(Exception):
+    """There are no runs for a figure."""
+
+
 @dataclass
 class Run:
     config: Config
@@ -206,7 +210,7 @@ def summary(runs: list[Run], results: Path) -> Path:
     """Write the tables and the tasks' figures, without runs that were stopped before their last
     epoch."""
     if not runs:
-        raise LookupError
+        raise Missing
     tasks = by_task([run for run in runs if len(run.success) >= run.config.epochs])
     panels = defaultdict(dict)
     for (folder, plan), methods in tasks.items():
@@ -285,10 +289,10 @@ def curves(panels: dict[str, Lines], title: str, what: str = "test success rate"
 
 def paper_figure(name: str, runs: list[Run]) -> Figure:
     """A panel for each task in which there is something to compare VCP with or, if there is none,
-    for each task; of Figure 4 for each. LookupError where nothing is compared."""
+    for each task; of Figure 4 for each. Missing without runs to compare."""
     runs = [run for run in runs if label(run.config) in FIGURES[name][1]]
     if len({label(run.config) for run in runs}) < (1 if name in ("fig2", "fig4") else 2):
-        raise LookupError
+        raise Missing
     tasks = {"\n".join(filter(None, task)): methods for task, methods in by_task(runs).items()}
     title = f"{FIGURES[name][0]}; Appendix B's schedule unless said"
     if name == "fig4":
@@ -303,12 +307,14 @@ def paper_figure(name: str, runs: list[Run]) -> Figure:
 
 
 def overview(runs: list[Run]) -> Figure:
-    """README's figure: four methods on three tasks. LookupError if one of them is missing."""
-    found = {task: dict(methods) for task, methods in by_task(runs).items()}
+    """README's figure: four methods on three tasks."""
     names = ("VCP", "VCP, uniform priority", "HER, 16 heads", "HER")
-    tasks = ("FetchReach-v1", "FetchPush-v1", "HandReach-v0")
-    panels = {task: success({name: found[task, ""][name] for name in names}) for task in tasks}
-    return curves(panels, "One network (HER), and three times the same 16 heads")
+    found = by_task(runs)
+    tasks = {t: found.get((t, ""), {}) for t in ("FetchReach-v1", "FetchPush-v1", "HandReach-v0")}
+    if not all({*names} <= methods.keys() for methods in tasks.values()):
+        raise Missing
+    panels = {t: success({name: methods[name] for name in names}) for t, methods in tasks.items()}
+    return curves(panels, "HER has one network, the others have 16 heads")
 
 
 def priority_figure(runs: list[Run]) -> Figure:
@@ -322,7 +328,7 @@ def priority_figure(runs: list[Run]) -> Figure:
             arms[task.removesuffix(", ")][run.config.priority].append(run)
     arms = {task: found for task, found in arms.items() if {"uniform", "consistency"} <= set(found)}
     if not arms:
-        raise LookupError
+        raise Missing
     fig = Figure(figsize=(8.3, 0.6 * len(arms) + 1), layout="constrained")
     ax = fig.subplots()
     words = {"consistency": "Eq. (4)", "within-kind": "Eq. (4) within each kind"}
@@ -369,7 +375,7 @@ def draw(name: str, results: Path = RESULTS) -> Path:
         sys.exit(f"figures.py: {error.filename} is missing: experiments.didactic")
     except ModuleNotFoundError as error:
         sys.exit(f"figures.py: {name}: {error}: pip install -r requirements-experiments.txt")
-    except LookupError:
+    except Missing:
         sys.exit(f"figures.py: {name} compares runs that are not in {results}")
     path = results / f"{name}.png"
     figure.savefig(path, dpi=100)

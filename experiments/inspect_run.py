@@ -2,8 +2,8 @@
 
 WHAT is one of
     effective    how much Eq. (4) prefers, at the paper's temperatures: the effective sample size of
-                 B_h, 1 / Σ p², as a share of its transitions (100 % is uniform), that of its
-                 hindsight alone, and the share of originals among the draws
+                 B_h, 1 / Σ p², as a share of its transitions (100 % is uniform); the same of the
+                 hindsight alone; the share of originals among the draws
     replayed     what each method would draw from the run's B_o: the share of originals, and of
                  transitions whose goal is still ahead (r = -1). In a task with an object most
                  others are at their goal because nothing has touched the object
@@ -24,6 +24,7 @@ from harness.errors import UsageError
 from harness.settings import METHODS, Config
 from vcp import update_her_buffer, value_consistency_priority
 
+EFFECTIVE = "size; that of hindsight alone; originals drawn"
 TEMPERATURES = (1, 5, 9, 11, 15)  # Appendix B
 BATCHES = 160  # mini-batches that `replayed` looks at
 SCORED = 4096  # transitions at once, by Algorithm 1
@@ -31,8 +32,8 @@ SCORED = 4096  # transitions at once, by Algorithm 1
 
 def effective_share(p: np.ndarray) -> float:
     """1 / (N Σ p²) for the probabilities (N,) in B_h, or of a part of it, scaled to a sum of 1:
-    between 1/N, one is always drawn, and 1."""
-    return float(np.square(p.sum()) / (len(p) * np.square(p).sum()))
+    between 1/N, one is always drawn, and 1. NaN of nothing."""
+    return float(np.square(p.sum()) / (len(p) * np.square(p).sum())) if len(p) else np.nan
 
 
 def effective(parts: Parts) -> list[str]:
@@ -41,8 +42,8 @@ def effective(parts: Parts) -> list[str]:
         raise UsageError(f"a run of --method {parts.config.method} has no B_h")
     data = {name: x[: parts.her_buffer.size] for name, x in parts.her_buffer.data.items()}
     priorities = [value_consistency_priority(data["variance"], t) for t in TEMPERATURES]
-    kind = data["hindsight"]
-    shares = [(effective_share(p), effective_share(p[kind]), p[~kind].sum()) for p in priorities]
+    h = data["hindsight"]
+    shares = [(effective_share(p), effective_share(p[h]), p[~h].sum()) for p in priorities]
     return ["; ".join(f"{share:.1%}" for share in cell) for cell in shares]
 
 
@@ -100,7 +101,7 @@ def dead(parts: Parts) -> list[str]:
 
 
 TABLES = {
-    "effective": (effective, [f"𝒯 = {t}: size; of hindsight; originals" for t in TEMPERATURES]),
+    "effective": (effective, [f"𝒯 = {t}: {EFFECTIVE}" for t in TEMPERATURES]),
     "replayed": (replayed, [f"{method.upper()}: originals; ahead" for method in METHODS]),
     "dead": (dead, ["actor's trunk", "actors' heads", "critic's trunk", "critics' heads"]),
 }

@@ -153,15 +153,19 @@ def in_ray(runs: list[Config], cores: float, gpus: float, address: str | None) -
         runtime_env={"env_vars": {"PYTHONPATH": str(ROOT)}},
     )
     task = ray.remote(num_cpus=cores, num_gpus=gpus, max_retries=3)(train_one)
-    waiting = {task.remote(config, os.getcwd()): config.out for config in runs}
+    waiting = {task.remote(config, os.getcwd()): config for config in runs}
     failed = {}
-    for _ in tqdm(runs, unit="run"):
-        (done,), _ = ray.wait(list(waiting))
-        folder = waiting.pop(done)
-        try:
-            ray.get(done)
-        except ray.exceptions.RayError as error:
-            failed[folder] = str(error).strip().splitlines()[-1]
+    with tqdm(total=sum(config.epochs for config in runs), unit="epoch") as bar:
+        while waiting:
+            ready, _ = ray.wait(list(waiting), timeout=1)
+            for done in ready:
+                folder = waiting.pop(done).out
+                try:
+                    ray.get(done)
+                except ray.exceptions.RayError as error:
+                    failed[folder] = str(error).strip().splitlines()[-1]
+            bar.n = sum(epochs_done(config) for config in runs)
+            bar.set_postfix(left=len(waiting), failed=len(failed))
     ray.shutdown()
     return failed
 

@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import json
 import re
+import shutil
 import signal
 import sys
 from dataclasses import asdict
@@ -170,6 +171,18 @@ def test_what_the_priority_is_worth(tmp_path):
     points = [line.get_xdata() for line in ax.lines if line.get_marker() in ("o", "s")]
     np.testing.assert_allclose(points, [[0.07, 0.07], [-0.07, -0.07]])
     assert [text.get_text() for text in ax.get_yticklabels()] == ["FetchReach-v1"]
+
+
+def test_readmes_figure_has_four_methods_on_three_tasks(tmp_path):
+    methods = ({}, {"priority": "uniform"}, {"method": "her"}, {"method": "her", "heads": 1})
+    tasks = ["FetchReach-v1", "FetchPush-v1", "HandReach-v0"]
+    for env in [*tasks, "Reacher-v2"]:
+        for i, given in enumerate(methods):
+            make_run(tmp_path / env / str(i), env=env, **given)
+    fig = figures.overview(figures.read_runs(tmp_path))
+    assert [ax.get_title() for ax in fig.axes] == [f"{env}\n1 run" for env in tasks]
+    assert len(fig.legends[0].get_texts()) == 4 and {len(ax.lines) for ax in fig.axes} == {4}
+    shutil.rmtree(tmp_path / "FetchPush-v1" / "3")
     with pytest.raises(SystemExit, match="overview compares runs that are not in"):
         figures.draw("overview", tmp_path)
 

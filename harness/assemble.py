@@ -67,9 +67,10 @@ class Parts:
         return {"agent": agent, "episodes": episodes, "replay": replay}
 
     def load_state(self, state: dict) -> None:
-        """Take over a `state`; B_o must be empty."""
+        """Take over a `state` of parts of the same sizes."""
         self.agent.load_state_dict(state["agent"])
-        self.original_buffer.add(state["episodes"], np.random.default_rng())  # none makes room
+        self.original_buffer.size = 0  # so nothing is overwritten, and nothing random is drawn
+        self.original_buffer.add(state["episodes"], np.random.default_rng(0))
         self.replay.load_state_dict(state["replay"])
 
     def threads(self) -> int:
@@ -185,7 +186,7 @@ def make_replay(
     at_once = max(n for n in range(1, 41) if drawn % n == 0)
     if config.method == "her":
         return HERReplay(original_buffer, at_once=at_once)
-    common = {"env_name": config.env, "at_once": at_once}
+    common = {"env_name": settings.without_package(config.env), "at_once": at_once}
     if config.method == "herebp":
         return herebp.HEREBP(original_buffer, **common, dt=task.dt)
     if config.method == "cher":

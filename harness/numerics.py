@@ -4,7 +4,7 @@ from contextlib import contextmanager
 
 import torch
 
-products = torch.backends.mkldnn.matmul
+matmul = torch.backends.mkldnn.matmul
 
 
 def begin_thread() -> None:
@@ -16,7 +16,7 @@ def begin_thread() -> None:
 
 @contextmanager
 def for_training():
-    """Run the block's PyTorch calls
+    """Run the block's PyTorch calls, those of `run.train` and of playing,
 
     - on one thread each. Products of this size gain little from more, and where a core is busy with
       something else, threads that meet after each product wait for it every time: such a run has
@@ -29,28 +29,28 @@ def for_training():
       processors with a unit for that (AMX) then do round, and for them MKL stays.
     """
     threads, denormals = torch.get_num_threads(), denormals_are_zero()
-    precision = products.fp32_precision
+    precision = matmul.fp32_precision
     begin_thread()
-    products.fp32_precision = "bf16"
+    matmul.fp32_precision = "bf16"
     if products_are_rounded():
-        products.fp32_precision = precision
+        matmul.fp32_precision = precision
     try:
         yield
     finally:
         torch.set_num_threads(threads)
         torch.set_flush_denormal(denormals)
-        products.fp32_precision = precision
+        matmul.fp32_precision = precision
 
 
 @contextmanager
 def small_calls():
     """Run the block with MKL's products: acting is too little work for oneDNN's."""
-    precision = products.fp32_precision
-    products.fp32_precision = "ieee"
+    precision = matmul.fp32_precision
+    matmul.fp32_precision = "ieee"
     try:
         yield
     finally:
-        products.fp32_precision = precision
+        matmul.fp32_precision = precision
 
 
 def denormals_are_zero() -> bool:

@@ -34,6 +34,7 @@ ABOUT = ("env", "episode_length", "method", "seed")  # what a policy says of its
 
 
 @numerics.for_training()
+@numerics.small_calls()
 def play(source: Path, gif: str | None = None, policy: str | None = None) -> np.ndarray:
     """Play EPISODES test episodes with each head of a run's folder or with a policy's file, print
     the success rates, write the best head to the file `policy`, and show SHOWN episodes of it: in a

@@ -106,9 +106,9 @@ def held(folder: Path, resume: bool) -> Iterator[None]:
 
 
 def begin(folder: Path, config: dict, parts, resume: bool) -> list[dict]:
-    """The rows so far: none or, with `resume`, those of the checkpoint, to whose state the
-    assemble.Parts are brought. A finished run's config.json keeps the commit and versions that made
-    it. UsageError as in `restore`."""
+    """With `resume`, bring the assemble.Parts to the checkpoint's state. Returns the rows so far. A
+    finished run's config.json keeps the commit and versions that made it. UsageError as in
+    `restore`."""
     rows = restore(folder, config, parts) if resume else []
     if len(rows) < config["epochs"]:
         write_config(folder, config)
@@ -122,8 +122,9 @@ def _refuse_another(folder: Path, resume: bool) -> None:
 
 
 def save(folder: Path, config: dict, rows: list[dict], state: dict) -> None:
-    """The end of an epoch: checkpoint.pt, then progress.csv and curve.png. state: assemble.Parts'.
-    FloatingPointError, and nothing written, for NaN or Inf in the networks."""
+    """The end of an epoch: checkpoint.pt, then progress.csv and curve.png. state: what
+    `assemble.Parts.state` gives. FloatingPointError, and nothing written, for NaN or Inf in the
+    networks."""
     if not all(p.isfinite().all() for net in state["agent"]["networks"] for p in net):
         raise FloatingPointError("NaN or Inf in the networks")
     save_checkpoint(folder, {"config": config, "rows": rows, "state": as_tensors(state)})
@@ -164,12 +165,12 @@ def epochs_done(folder: Path) -> int:
         return 0
 
 
-def save_checkpoint(folder: Path, state: dict) -> None:
-    """checkpoint.pt. state: tensors and plain Python alone."""
+def save_checkpoint(folder: Path, content: dict) -> None:
+    """checkpoint.pt. content: tensors and plain Python alone."""
 
     def write(file):
         try:
-            torch.save({"format": FORMAT, **state}, file)
+            torch.save({"format": FORMAT, **content}, file)
         except RuntimeError as error:  # torch's own, from closing its archive on a full disk
             raise error.__context__ if isinstance(error.__context__, OSError) else error from None
 

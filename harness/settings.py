@@ -87,7 +87,7 @@ class Config:
 
     device: str = setting(
         "auto",
-        "where the networks are; auto: a GPU if any, for many updates of all heads at once",
+        "where the networks are; auto: a GPU, if any, where all heads step together, often",
         ["auto", "cpu", "cuda"],
     )
     threads: int | None = setting(
@@ -104,6 +104,7 @@ OF_VCP = ("temperature", "priority", "importance", "scored_per_drawn", "her_buff
 
 def paper_schedule(env: str, method: str = "vcp") -> dict[str, int]:
     """Appendix B's n and batch size. Not in the paper: the number of updates."""
+    env = without_package(env)
     if method == "dtgsh":  # Appendix B: batch 64 everywhere, and as many transitions as the others
         schedule = paper_schedule(env)
         updates = schedule["updates"] * schedule["batch_size"] // 64
@@ -115,11 +116,16 @@ def paper_schedule(env: str, method: str = "vcp") -> dict[str, int]:
     return {"cycles": 50, "updates": 40, "batch_size": 256}
 
 
+def without_package(env: str) -> str:
+    """gymnasium_robotics:FetchReach-v4 and FetchReach-v4 are the same task."""
+    return env.removeprefix("gymnasium_robotics:")
+
+
 def action_penalty(env: str) -> float:
     """HER's 1 for the paper's tasks, by the beginning of their names. Others do better with a tenth
     of it (not in the paper; docs/environments.md has the runs)."""
     paper = ("Fetch", "Hand", "PointMass", "Reacher", "SparseReacher")
-    return 1.0 if env.startswith(paper) else 0.1
+    return 1.0 if without_package(env).startswith(paper) else 0.1
 
 
 def heads_at_once(updates: int, heads: int) -> int:
@@ -140,14 +146,12 @@ def scored_a_sweep(config: Config) -> int:
 
 
 def complete(config: Config) -> Config:
-    """A copy with schedule, heads at once, capacity of B_h, device and folder filled in. UsageError
-    for a setting of the wrong type, out of range, or of another method."""
+    """A copy with all that is None by default filled in, but for what the run's parts decide.
+    UsageError for a setting of the wrong type, out of range, or of another method."""
     given = {name: value for name, value in asdict(config).items() if value is not None}
     for f in fields(Config):
         if f.name in given:
             given[f.name] = checked(f, given[f.name])
-    if "env" in given:  # one name for an environment that is registered anyway
-        given["env"] = given["env"].removeprefix("gymnasium_robotics:")
     method = given.get("method", "vcp")
     config = Config(**{**paper_schedule(given.get("env", Config.env), method), **given})
     for name in OF_VCP if method != "vcp" else ():
@@ -171,7 +175,8 @@ def complete(config: Config) -> Config:
     if config.heads % config.heads_at_once:
         raise UsageError(f"--heads-at-once must divide the {config.heads} heads")
     if config.device == "auto":
-        # Heads in turn are many small calls, which a GPU hardly makes faster (results/SPEED.md).
+        # Heads in turn are many small calls, which a GPU hardly makes faster (results/SPEED.md);
+        # where updates are few, most of the time goes into collecting.
         much = config.heads_at_once == config.heads and config.updates > FEW
         config.device = "cuda" if much and torch.cuda.is_available() else "cpu"
     if config.device == "cuda" and not torch.cuda.is_available():

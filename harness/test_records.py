@@ -180,6 +180,9 @@ def test_a_flipped_bit_is_noticed(whole, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(whole, folder)
     (parts, _), config = restored(folder), records.read_config(folder)
+    episodes = parts.original_buffer.size
+    records.restore(folder, config, parts)  # once more, in place of what is there
+    assert parts.original_buffer.size == episodes > 0
     path = folder / records.CHECKPOINT
     bytes_, rng = path.read_bytes(), random.Random(0)
     with zipfile.ZipFile(path) as archive:  # its alignment's padding holds nothing to be noticed
