@@ -4,9 +4,9 @@ WHAT is one of
     effective    how much Eq. (4) prefers, at the paper's temperatures: the effective sample size of
                  B_h, 1 / Σ p², as a share of its transitions (100 % is uniform); the same of the
                  hindsight alone; the share of originals among the draws
-    replayed     what each method would draw from the run's B_o: the share of originals, and of
-                 transitions whose goal is still ahead (r = -1). In a task with an object most
-                 others are at their goal because nothing has touched the object
+    goals        whether the critics disagree on hindsight whose goal is like those that are tested:
+                 by the variance of the hindsight in B_h, the share whose goal is nearer to one of
+                 2,000 goals of episodes than to any of 2,000 goals of other hindsight
     dead         the share of the networks' hidden units that are 0 for all of 4,096 transitions,
                  and learn no more
 """
@@ -19,15 +19,14 @@ import torch
 
 from ensemble import MultiHeadMLP, linear
 from harness import settings
-from harness.assemble import Parts, make_replay, restored
+from harness.assemble import Parts, restored
 from harness.errors import UsageError
-from harness.settings import METHODS, Config
-from vcp import update_her_buffer, value_consistency_priority
+from vcp import value_consistency_priority
 
 EFFECTIVE = "size; that of hindsight alone; originals drawn"
 TEMPERATURES = (1, 5, 9, 11, 15)  # Appendix B
-BATCHES = 160  # mini-batches that `replayed` looks at
-SCORED = 4096  # transitions at once, by Algorithm 1
+QUANTILES = ((0, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 1))  # of the hindsight's variance
+AMONG = 2000  # goals of each kind that `goals` looks at
 
 
 def effective_share(p: np.ndarray) -> float:
@@ -36,43 +35,37 @@ def effective_share(p: np.ndarray) -> float:
     return float(np.square(p.sum()) / (len(p) * np.square(p).sum())) if len(p) else np.nan
 
 
-def effective(parts: Parts) -> list[str]:
-    """A cell for each of the TEMPERATURES. UsageError for a run without B_h."""
+def stored(parts: Parts) -> dict[str, np.ndarray]:
+    """The rows of B_h. UsageError for a run that has none."""
     if parts.her_buffer is None:
         raise UsageError(f"a run of --method {parts.config.method} has no B_h")
-    data = {name: x[: parts.her_buffer.size] for name, x in parts.her_buffer.data.items()}
+    return {name: x[: parts.her_buffer.size] for name, x in parts.her_buffer.data.items()}
+
+
+def effective(parts: Parts) -> list[str]:
+    """A cell for each of the TEMPERATURES. UsageError as `stored`."""
+    data = stored(parts)
     priorities = [value_consistency_priority(data["variance"], t) for t in TEMPERATURES]
     h = data["hindsight"]
     shares = [(effective_share(p), effective_share(p[h]), p[~h].sum()) for p in priorities]
     return ["; ".join(f"{share:.1%}" for share in cell) for cell in shares]
 
 
-def shares(parts: Parts, method: str, rng: np.random.Generator) -> dict[str, float]:
-    """Of what `method` draws from the run's B_o, with the batch and the B_h of Appendix B's larger
-    tasks, the share of originals and of transitions on their way."""
-    schedule = settings.paper_schedule("FetchPush-v1", method)
-    config = settings.complete(
-        Config(env=parts.config.env, method=method, heads=parts.config.heads, **schedule)
-    )
-    replay = make_replay(config, parts.task, parts.original_buffer)
-    if method == "vcp":
-        for _ in range(replay.capacity // SCORED):
-            update_her_buffer(replay, parts.original_buffer, parts.agent.q_variance, SCORED, rng)
-    else:
-        replay.new_episodes(np.arange(parts.original_buffer.size))
-    batches = [replay.sample(config.batch_size, rng) for _ in range(BATCHES)]
-    originals = np.mean([~batch["hindsight"] for batch in batches])
-    return {"originals": originals, "ahead": np.mean([batch["reward"] < 0 for batch in batches])}
-
-
-def replayed(parts: Parts) -> list[str]:
-    """A cell for each of METHODS; VCP with the critic of one network has none."""
-    rng, cells = np.random.default_rng(0), []
-    for method in METHODS:
-        if method == "vcp" and parts.config.heads == 1:
-            cells.append("")
-        else:
-            cells.append("; ".join(f"{share:.1%}" for share in shares(parts, method, rng).values()))
+def goals(parts: Parts) -> list[str]:
+    """A cell for each of the QUANTILES. UsageError as `stored`, and without originals."""
+    data, rng = stored(parts), np.random.default_rng(0)
+    if data["hindsight"].all():
+        raise UsageError("all of B_h is hindsight: no tested goals to compare with")
+    goal, h = data["goal"] / data["goal"].std(axis=0), data["hindsight"]
+    order = np.flatnonzero(h)[np.argsort(data["variance"][h])]
+    others, tested = rng.choice(order, AMONG), rng.choice(np.flatnonzero(~h), AMONG)
+    among = goal[np.concatenate([others, tested])]
+    cells = []
+    for low, high in QUANTILES:
+        i = rng.permutation(order[round(low * len(order)) : round(high * len(order))])[:AMONG]
+        apart = np.stack([np.square(among - x).sum(axis=1) for x in goal[i]])
+        apart[apart < 1e-9] = np.inf  # itself
+        cells.append(f"{np.mean(apart.argmin(axis=1) >= AMONG):.1%}")
     return cells
 
 
@@ -102,7 +95,7 @@ def dead(parts: Parts) -> list[str]:
 
 TABLES = {
     "effective": (effective, [f"𝒯 = {t}: {EFFECTIVE}" for t in TEMPERATURES]),
-    "replayed": (replayed, [f"{method.upper()}: originals; ahead" for method in METHODS]),
+    "goals": (goals, [f"variance, {low:.0%} to {high:.0%}" for low, high in QUANTILES]),
     "dead": (dead, ["actor's trunk", "actors' heads", "critic's trunk", "critics' heads"]),
 }
 
