@@ -52,18 +52,16 @@ def effective(parts: Parts) -> list[str]:
 
 
 def goals(parts: Parts) -> list[str]:
-    """A cell for each of the QUANTILES. UsageError as `stored`, and without originals."""
+    """A cell for each of the QUANTILES. UsageError as `stored`."""
     data, rng = stored(parts), np.random.default_rng(0)
-    if data["hindsight"].all():
-        raise UsageError("all of B_h is hindsight: no tested goals to compare with")
-    goal, h = data["goal"] / data["goal"].std(axis=0), data["hindsight"]
-    order = np.flatnonzero(h)[np.argsort(data["variance"][h])]
-    others, tested = rng.choice(order, AMONG), rng.choice(np.flatnonzero(~h), AMONG)
-    among = goal[np.concatenate([others, tested])]
-    cells = []
+    hindsight = np.flatnonzero(data["hindsight"])
+    order = hindsight[np.argsort(data["variance"][hindsight])]
+    achieved, tested = data["goal"], parts.original_buffer.episodes["desired_goal"]
+    among = np.concatenate([achieved[rng.choice(order, AMONG)], rng.choice(tested, AMONG)])
+    scale, cells = achieved[order].std(axis=0), []
     for low, high in QUANTILES:
         i = rng.permutation(order[round(low * len(order)) : round(high * len(order))])[:AMONG]
-        apart = np.stack([np.square(among - x).sum(axis=1) for x in goal[i]])
+        apart = np.stack([np.square((among - x) / scale).sum(axis=1) for x in achieved[i]])
         apart[apart < 1e-9] = np.inf  # itself
         cells.append(f"{np.mean(apart.argmin(axis=1) >= AMONG):.1%}")
     return cells
