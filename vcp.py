@@ -49,7 +49,7 @@ def priority_within_kinds(variance, hindsight, temperature: float):
     kind by its own variances and drawn as often as it stands there. (N,), (N,) bool -> (N,).
 
     Where the variance of originals is far above the rest, Eq. (4) over both kinds together leaves
-    them out (NOTES.md, "Originals and hindsight in one B_h").
+    them out (NOTES.md, "Where does the priority help?").
     """
     p = 0 * variance
     for kind in (hindsight, ~hindsight):
