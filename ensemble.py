@@ -94,6 +94,8 @@ class Normalizer:
     def update(self, x: np.ndarray) -> None:
         """Add the rows of x, (B, dim), to the statistics."""
         x = np.clip(np.asarray(x, dtype=np.float64), -200, 200)
+        if not len(x):
+            return
         self.count += len(x)
         self.sums += torch.from_numpy(np.stack([x.sum(axis=0), np.square(x).sum(axis=0)]))
         mean, mean_of_squares = self.sums / self.count

@@ -106,7 +106,7 @@ def relabel_given(
     relabel_ratio: float,
     reward_fn: RewardFn,
 ) -> Batch:
-    """`relabel_future` for given transitions: the steps t (B,) of the episodes e (B,)."""
+    """`relabel_future` for given transitions (Section 3.2): the steps t (B,) of episodes e (B,)."""
     achieved, horizon = episodes["achieved_goal"], episodes["action"].shape[1]
     hindsight = rng.random(len(e)) < relabel_ratio
     future = rng.integers(t + 1, horizon + 1)  # t' ~ U{t+1, ..., T}

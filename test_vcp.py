@@ -511,6 +511,8 @@ def test_normalizer_against_numpy():
     """Inputs would be standardised by something else than the mean and deviation of all rows."""
     x = np.random.default_rng(0).normal([0, 5, -1000, 3], [1, 0.1, 500, 0], (10_000, 4))
     normalizer = Normalizer(4)
+    normalizer.update(x[:0])  # no rows change nothing
+    assert normalizer.mean.tolist() == 4 * [0] and normalizer.std.tolist() == 4 * [1]
     for part in np.array_split(x, 7):
         normalizer.update(part)
     clipped = np.clip(x, -200, 200)

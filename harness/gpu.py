@@ -83,7 +83,7 @@ class EnsembleOnGPU(EnsembleDDPG):
         """Forget the captured graph and what the player copied: both are of other weights."""
         self._steps, self._followed = 0, None
         self._graph = None
-        # loading replaces it
+        # said again after loading, which replaces the groups
         self.optimizer.param_groups[0]["capturable"] = self.device.type == "cuda"
 
     def load_state_dict(self, state: dict) -> None:

@@ -295,7 +295,7 @@ def test_what_only_comes_later_stops_the_run(workers, message, env, tmp_path, ca
         ("no picture", lambda self: np.zeros((0, 0, 3), np.uint8)),
         ("no picture", lambda self: np.zeros((9, 9), np.uint8)),
         ("no picture", lambda self: np.zeros((9, 9, 4), np.uint8)),
-        ("render raised NotImplementedError", Line.render),
+        ("render raised NotImplementedError", Line.render),  # gymnasium's, where there is no other
     ],
 )
 def test_pictures_that_are_none_are_refused(message, render):
