@@ -172,7 +172,7 @@ def tables(tasks: Tasks) -> dict[str, list[str]]:
     """The lines for each README.md: of a task over the epochs that all its runs have, and over as
     many as VCP's longest run; and of all tasks a line each."""
     columns = ("VCP", "VCP, uniform priority", "HER, 16 heads", "HER")
-    heads = ("task", "epochs", *columns, "VCP in the end", "HER in the end")
+    heads = ("task", "epochs", *columns)
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     texts = defaultdict(list, {"README.md": lines})
     for (folder, plan), methods in tasks.items():
@@ -186,11 +186,6 @@ def tables(tasks: Tasks) -> dict[str, list[str]]:
         for method in columns:
             means = [run.success[:shortest].mean() for run in methods.get(method, [])]
             cells.append(f"{np.mean(means):.2f} ({len(means)})" if means else "")
-        for method in ("VCP", "HER"):
-            curves = [run.success for run in methods.get(method, [])]
-            most = max(map(len, curves), default=0)
-            ends = [curve[-1] for curve in curves if len(curve) == most]
-            cells.append(f"{np.mean(ends):.2f} after {most} ({len(ends)})" if ends else "")
         lines.append(f"| {' | '.join(cells)} |")
     return texts
 

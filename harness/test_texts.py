@@ -12,7 +12,8 @@ import pytest
 
 import run
 from harness import cli, settings
-from harness.play import play
+from harness.play import play, read_policy
+from harness.records import read_rows
 from harness.testing import HERE
 
 TEXTS = sorted(
@@ -133,7 +134,10 @@ def test_the_commands_that_are_shown_run(command, whole, tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize("policy", sorted(HERE.glob("results/**/policy.npz")), ids=str)
-def test_the_policies_in_results_reach_their_goals(policy, monkeypatch):
+def test_the_policies_in_results_do_what_their_runs_did(policy, monkeypatch):
+    """The best of the run's heads reaches about as many goals as the heads' mean did, or more."""
     monkeypatch.delenv("DISPLAY", raising=False)
     assert policy.stat().st_size < 1_000_000
-    assert play(policy) >= 0.9
+    _, about = read_policy(policy)
+    row = read_rows(policy.parent)[about["epoch"] - 1]
+    assert play(policy) >= row["test_success_rate"] - 0.1
