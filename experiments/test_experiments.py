@@ -24,7 +24,7 @@ from harness.errors import UsageError
 from harness.records import COLUMNS, epochs_done
 from harness.settings import METHODS, Config
 from harness.tasks import PAPER_ENVS
-from harness.testing import Line, finish, start, wait_for_an_epoch
+from harness.testing import HERE, Line, finish, start, wait_for_an_epoch
 from run import train
 from vcp import value_consistency_priority
 
@@ -193,6 +193,22 @@ def test_every_table_in_results_is_generated():
         generated, after = generated.split(figures.END)
         assert generated.strip() == "\n".join(lines).strip(), f"{name}: figures summary"
         assert not re.search(r"^\|", before + after, re.M), f"{name} has a table that is typed"
+
+
+@pytest.mark.parametrize("env", PAPER_ENVS)
+def test_environments_md_says_how_far_each_task_was_learned(env):
+    """Success after the last epoch, averaged over the longest runs in results/."""
+    text = (HERE / "docs" / "environments.md").read_text()
+    row = re.findall(rf"^\| {env} .*", text, re.M)[-1]
+    schedule = "_updates-5_batch_size-64" if env.startswith("PointMass") else ""
+    for column, name in ((4, f"vcp{schedule}"), (5, f"her{schedule}_heads-1")):
+        files = [*figures.RESULTS.glob(f"{env}/{name}/*/progress.csv")]
+        files += figures.RESULTS.glob(f"{env}/gpu_{name}/*/progress.csv")
+        ends = [list(csv.DictReader(file.open()))[-1] for file in files]
+        most = max(int(end["epoch"]) for end in ends)
+        last = [float(end["test_success_rate"]) for end in ends if int(end["epoch"]) == most]
+        cell = row.split("|")[column].strip()
+        assert cell == f"{np.mean(last):.2f} after {most} ({len(last)})", row
 
 
 def test_runs_are_compared_by_seed_and_machine(tmp_path):
