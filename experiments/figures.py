@@ -254,21 +254,23 @@ def draw_line(ax: Axes, seeds: list[np.ndarray], style: int, text: str) -> None:
 
 
 def curves(panels: dict[str, Lines], title: str, what: str = "test success rate") -> Figure:
-    """A panel for each title, in it a line for each label. Another thing than a rate is drawn on a
-    logarithmic scale."""
+    """A panel for each title, in it a line for each label. A rate's axis ends at 1, or at 0.1 where
+    no run reaches that. Another thing than a rate is drawn on a logarithmic scale."""
     names = list(dict.fromkeys(name for methods in panels.values() for name in methods))
     columns = min(len(panels), 3)
     lines = -(-len(panels) // columns)
     fig = Figure(figsize=(8.3, 2.9 * lines + 1.1), layout="constrained")
-    axes = fig.subplots(lines, columns, squeeze=False, sharey=True).flat
+    axes = fig.subplots(lines, columns, squeeze=False, sharey="rate" not in what).flat
     entries = {}
     for ax, (text, methods) in zip(axes, panels.items(), strict=False):
         for name, seeds in methods.items():
             draw_line(ax, seeds, names.index(name), name)
         few, many = min(map(len, methods.values())), max(map(len, methods.values()))
         number = f"{few}" if few == many else f"{few} to {many}"
-        ax.set_title(f"{text}\n{number} run{'s' * (many > 1)}".strip(), fontsize=9)
-        ax.set(xlabel="epoch", **({"ylim": (-0.03, 1.03)} if "rate" in what else {"yscale": "log"}))
+        ax.set_title(f"{text}\n{number} run{'s' * (many > 1)}".strip(), fontsize=8)
+        top = 1 if max(x.max() for seeds in methods.values() for x in seeds) > 0.1 else 0.1
+        rate = {"ylim": (-0.03 * top, 1.03 * top)}
+        ax.set(xlabel="epoch", **(rate if "rate" in what else {"yscale": "log"}))
         ax.xaxis.get_major_locator().set_params(integer=True)
         ax.grid(alpha=0.3)
         entries |= dict(zip(*ax.get_legend_handles_labels()[::-1], strict=True))

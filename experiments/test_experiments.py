@@ -195,6 +195,13 @@ def test_every_table_in_results_is_generated():
         assert not re.search(r"^\|", before + after, re.M), f"{name} has a table that is typed"
 
 
+@pytest.mark.parametrize(("highest", "top"), [(0.1, 0.103), (0.11, 1.03), (1, 1.03)])
+def test_little_success_is_seen_in_a_panel_of_its_own(highest, top):
+    lines = {"VCP": [np.array([0, highest])]}
+    low, whole = figures.curves({"low": lines, "whole": {"VCP": [np.ones(2)]}}, "").axes
+    assert low.get_ylim()[1] == pytest.approx(top) and whole.get_ylim()[1] == pytest.approx(1.03)
+
+
 @pytest.mark.parametrize("env", PAPER_ENVS)
 def test_environments_md_says_how_far_each_task_was_learned(env):
     """Success after the last epoch, averaged over the longest runs in results/."""
