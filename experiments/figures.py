@@ -255,7 +255,7 @@ def draw_line(ax: Axes, seeds: list[np.ndarray], style: int, text: str) -> None:
 
 def curves(panels: dict[str, Lines], title: str, what: str = "test success rate") -> Figure:
     """A panel for each title, in it a line for each label. A rate's axis ends at 1, or at 0.1 where
-    no run reaches that. Another thing than a rate is drawn on a logarithmic scale."""
+    no run is above 0.1. Another thing than a rate is drawn on a logarithmic scale."""
     names = list(dict.fromkeys(name for methods in panels.values() for name in methods))
     columns = min(len(panels), 3)
     lines = -(-len(panels) // columns)
@@ -280,6 +280,8 @@ def curves(panels: dict[str, Lines], title: str, what: str = "test success rate"
     fig.legend(handles, names, loc="outside lower center", ncols=3, fontsize=9, handlelength=3)
     fig.supylabel(what, fontsize=10)
     means = "mean over seeds, with a 95 % interval from 5 on and each seed's line for fewer"
+    if len({ax.get_ylim() for ax in fig.axes[: len(panels)]}) > 1 and "rate" in what:
+        means += "\nthe axis ends at 0.1 where no run is above that"
     fig.suptitle(f"{title}\n{means}", fontsize=10)
     return fig
 

@@ -138,8 +138,8 @@ def test_the_summary(results):
     (results / "README.md").write_text(f"above\n\n{figures.BEGIN}\nold\n{figures.END}\n\nbelow\n")
     text = figures.draw("summary", results).read_text()
     assert text.startswith("above\n\n") and text.endswith("\n\nbelow\n") and "old" not in text
-    assert "| [FetchPush-v1](FetchPush-v1/README.md) | 6 |  |  |  | 0.67 (1) |" in text
-    assert "of 2 updates of batch 64 | 6 | 0.67 (1) |  |  |  |" in text
+    assert "| [FetchPush-v1](FetchPush-v1/README.md) | 6 |  |  |  | 0.67 (1) |\n" in text
+    assert "of 2 updates of batch 64 | 6 | 0.67 (1) |  |  |  |\n" in text
     vcp, longer = [r for r in rows_of(results / "Reacher-v2" / "README.md") if r[0] == "| VCP"]
     # success .2 .4 .6 .8 1 1 and .22 .42 .62 .82 1 1 1: six epochs that both have, seven of one
     assert vcp[1:] == ["0,1", "0.21 0.41 1.00 1.00", "0.673 (0.667 0.680)", " |"]
@@ -198,7 +198,9 @@ def test_every_table_in_results_is_generated():
 @pytest.mark.parametrize(("highest", "top"), [(0.1, 0.103), (0.11, 1.03), (1, 1.03)])
 def test_little_success_is_seen_in_a_panel_of_its_own(highest, top):
     lines = {"VCP": [np.array([0, highest])]}
-    low, whole = figures.curves({"low": lines, "whole": {"VCP": [np.ones(2)]}}, "").axes
+    fig = figures.curves({"low": lines, "whole": {"VCP": [np.ones(2)]}}, "")
+    low, whole = fig.axes
+    assert ("axis ends at 0.1" in fig.get_suptitle()) == (top < 1)
     assert low.get_ylim()[1] == pytest.approx(top) and whole.get_ylim()[1] == pytest.approx(1.03)
 
 
