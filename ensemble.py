@@ -213,8 +213,8 @@ class EnsembleDDPG:
         return self.update_heads([k], [batch])[0]
 
     def update_heads(self, heads: Sequence[int], batches: list[dict], map=map) -> torch.Tensor:
-        """`update_head` of n heads, each with a mini-batch of its own, in one step: the trunks' is
-        by the sum of the heads' gradients (NOTES.md, "Heads in turn or at once").
+        """`update_head` of n heads, each with a mini-batch of its own, in one step; the trunks
+        move by the sum of the heads' gradients (NOTES.md, "Heads in turn or at once").
 
         map: such as a thread pool's. The heads' gradients do not depend on each other, and are
         added up in the heads' order, so the bits are the same for any number of threads.

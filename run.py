@@ -75,8 +75,8 @@ def train(config: Config, resume: bool = False) -> list[dict]:
             train_seed, test_seed, play_rng, her_rng, draw_rng = randomness(config.seed, number)
             epoch = Epoch(number, config.epochs, config.cycles + test_rounds)
             envs.reset(train_seed)
-            # + Appendix B: n cycles an epoch; VCP+: before the first one an episode at random in
-            # each environment, cycle 0, after which nothing is trained
+            # + Appendix B: n cycles an epoch; VCP+: before the first one cycle 0, an episode at
+            # random in each environment, without training
             for cycle in range(0 if number == 1 else 1, config.cycles + 1):
                 with epoch.timed("collect"):  # 3: data generation
                     at_random = config.random_actions if cycle else 1
@@ -166,8 +166,8 @@ def rollout(envs: ParallelEnvs, policy: Policy, horizon: int) -> tuple[dict, np.
 
 def acting_heads(agent: EnsembleDDPG, acting: int, num_envs: int, drawn=None) -> Policy:
     """π_k(s_t, g) of the first `acting` heads, which share the environments evenly: μ_k and what
-    `exploration` has drawn, or μ_k alone. It is asked for environments of whole heads, or for some
-    of the only head's."""
+    `exploration` has drawn, or μ_k alone. Each call is for all environments of some heads or, where
+    one head acts, for any."""
 
     def policy(t: int, which: slice, obs: np.ndarray, goal: np.ndarray) -> np.ndarray:
         first, end = which.start * acting // num_envs, math.ceil(which.stop * acting / num_envs)
