@@ -51,7 +51,8 @@ def slide_along_wall(x: float, y: float, to_x: float, to_y: float) -> tuple[floa
     """
     dx, dy = to_x - x, to_y - y
     side = 1.0 if y > 0 else -1.0
-    if side * y >= CLEARANCE > side * to_y:  # crosses the line of the strip's flat face
+    # The strip's flat face, of which rounding may have left the centre on the wrong side
+    if side * dy < 0 and side * to_y < CLEARANCE <= side * y + 1e-9:
         s = (side * CLEARANCE - y) / dy
         if x + s * dx <= WALL_END:
             return to_x, side * CLEARANCE
@@ -66,7 +67,9 @@ def slide_along_wall(x: float, y: float, to_x: float, to_y: float) -> tuple[floa
     if s > 1:
         return to_x, to_y
     s = max(s, 0.0)
-    nx, ny = (ex + s * dx) / CLEARANCE, (ey + s * dy) / CLEARANCE  # the normal at the contact
+    nx, ny = ex + s * dx, ey + s * dy
+    length = math.hypot(nx, ny)  # CLEARANCE, but for rounding, which would grow from step to step
+    nx, ny = nx / length, ny / length  # the normal at the contact
     into = (1 - s) * min(dx * nx + dy * ny, 0.0)
     return to_x - into * nx, to_y - into * ny
 

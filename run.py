@@ -40,6 +40,8 @@ Policy = Callable[[int, slice, np.ndarray, np.ndarray], np.ndarray]
 def train(config: Config, resume: bool = False) -> list[dict]:
     """Algorithm 2. Writes the run's folder and returns the rows of its progress.csv.
 
+    Where processes are spawned (macOS, Windows), a script calls it below `if __name__ ==
+    "__main__":`, as each worker imports the script.
     resume: go on with the run in config.out, after its last whole epoch. Everything random follows
     from (seed, epoch), so the rows are those of a run that was never stopped.
     UsageError, before anything is written, for a config that cannot be run; FloatingPointError

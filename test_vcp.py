@@ -619,6 +619,23 @@ def test_point_mass_is_stopped_by_walls_and_slides_along_them(wall):
     np.testing.assert_allclose(ends, expected, atol=2e-4)
 
 
+@pytest.mark.parametrize("push", [(-1, -1), (-1, -0.5), (-1, 1), (-0.5, -1)])
+def test_point_mass_does_not_creep_into_the_wall(push):
+    """Pushed straight into the round end for long, the circle would get in by rounding errors that
+    grow, and come out on the other side."""
+    env = PointMass(wall=True)
+    env.reset(seed=0)
+    env._xy = tuple(0.2 - 0.1414 * x / np.hypot(*push) for x in push)
+    env._xy = (env._xy[0], env._xy[1] - 0.2)
+    for _ in range(200):
+        xy = env.step(push)[0]["achieved_goal"]
+        assert distance_to_wall(xy[None])[0] >= 0.08 - 1e-12
+    env._xy = (0.27, 0.22)  # from here, by rounding, it touches where the flat face begins
+    for _ in range(9):
+        xy = env.step((-0.5, -1))[0]["achieved_goal"]
+        assert distance_to_wall(xy[None])[0] >= 0.08 - 1e-12
+
+
 def test_reacher_reports_the_fingertips_velocity():
     """The state would not be the eight numbers of Appendix A."""
     env = gym.make("SparseReacher-v1", disable_env_checker=True).unwrapped

@@ -10,7 +10,7 @@ Letters in the shape comments:
 
 import numpy as np
 
-from baselines.her import HERReplay
+from baselines.her import HERReplay, goal_part
 from her import Batch, EpisodeBuffer, relabel_given
 
 GROWTH = 1e-4  # of λ, with each update
@@ -87,7 +87,6 @@ class CHER(HERReplay):
     them to 1.22, and starts again. All heads of an ensemble update share a τ, so that it does not
     grow K times as fast.
 
-    Where the task is to rotate an object, its orientation alone counts, as in the original.
     heads: K; updates: of all heads, in an epoch.
     """
 
@@ -95,7 +94,7 @@ class CHER(HERReplay):
         self, buffer: EpisodeBuffer, *, env_name: str, heads: int, updates: int, **at_once
     ):
         super().__init__(buffer, **at_once)
-        self.goal_part = slice(3 if "Rotate" in env_name else 0, None)
+        self.goal_part = goal_part(env_name)
         self.heads, self.updates, self.drawn = heads, updates, 0
 
     def draw(self, count: int, batch_size: int, rng: np.random.Generator) -> Batch:

@@ -12,7 +12,7 @@ Letters in the shape comments:
 import numpy as np
 import torch
 
-from baselines.her import HERReplay
+from baselines.her import HERReplay, goal_part
 from her import Batch, EpisodeBuffer, relabel_given
 
 CANDIDATES = 100 / 64  # for each that is selected
@@ -94,15 +94,15 @@ class DTGSH(HERReplay):
     ∝ `trajectory_diversity`, of which `sample_k_dpp` keeps S by the diversity of their goals.
 
     The kernel is exp(-|g_i - g_j|² / 2σ²), with σ = 0.1 for the Hand and 0.5 elsewhere. Fetch's
-    diversities are limited to 0.001. Where the task is to rotate an object, its orientation alone
-    counts. All of this is the original's, which has settings for Fetch and Hand only.
+    diversities are limited to 0.001. All of this is the original's, which has settings for Fetch
+    and Hand only.
     """
 
     def __init__(self, buffer: EpisodeBuffer, *, env_name: str, **at_once):
         super().__init__(buffer, **at_once)
         self.sigma = 0.1 if env_name.startswith("Hand") else 0.5
         self.most = 0.001 if env_name.startswith("Fetch") else np.inf
-        self.goal_part = slice(3 if "Rotate" in env_name else 0, None)
+        self.goal_part = goal_part(env_name)
         self.diversity = np.zeros(self.buffer.capacity)
         self.cumulative = np.empty(0)
 

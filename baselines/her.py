@@ -5,6 +5,13 @@ import numpy as np
 from her import Batch, EpisodeBuffer
 
 
+def goal_part(env_name: str) -> slice:
+    """The numbers of a goal that CHER and DTGSH compare. Where the task is to rotate an object, its
+    orientation alone counts, as in the originals."""
+    rotates = env_name.startswith("HandManipulate") and "Rotate" in env_name
+    return slice(3 if rotates else 0, None)
+
+
 class HERReplay:
     """HER by itself (`--method her`): mini-batches straight from B_o, relabelled as they are drawn.
 

@@ -360,7 +360,11 @@ def test_settings_are_the_originals(env_name, sigma, most_diversity, most_energy
 @pytest.mark.parametrize("method", [partial(CHER, heads=1, updates=1), DTGSH])
 @pytest.mark.parametrize(
     ("env_name", "alone"),
-    [("HandManipulateEggRotate-v0", True), ("HandManipulateEggFull-v0", False)],
+    [
+        ("HandManipulateEggRotate-v0", True),
+        ("HandManipulateEggFull-v0", False),
+        ("mine:RotateArm-v0", False),
+    ],
 )
 def test_rotation_tasks_look_at_the_orientation_alone(method, env_name, alone):
     """The place of an object, which a rotation task does not ask for, would count."""

@@ -85,6 +85,7 @@ if __name__ == "__main__":
         replay_buffer_class=HerReplayBuffer if her else VCPReplayBuffer,
         replay_buffer_kwargs={} if her else {"priority": priority, "seed": seed},
         seed=seed,
+        device="cpu",
     )
     model.replay_buffer.critic = model.critic  # SB3 makes it after the buffer
     model.learn(steps, callbacks.EvalCallback(tests, n_eval_episodes=30, eval_freq=25))

@@ -181,6 +181,9 @@ def run_seconds(cycles: int, **given) -> tuple[float, float]:
 
 def bench_cores(repeats: int, cycles: int) -> None:
     """The table of results/SPEED.md: a sweep, a cycle and an epoch by the number of cores."""
+    if not hasattr(os, "sched_setaffinity"):
+        print("\n3. By the number of cores: on Linux alone")
+        return
     print(
         "\n3. By the number of cores: ms of a sweep, alone, with scoring beside it (line 13), that"
     )

@@ -1,6 +1,7 @@
 """Figures 3, 5 and 8, from runs on PointMassEmpty: python -m experiments.didactic
 
-Trains the runs below runs/didactic, or goes on with them, and writes what the figures need of their
+Trains the runs below runs/didactic, or goes on with them (but for Figure 5's, of which it needs the
+epochs on the way), and writes what the figures need of their
 networks and buffers to results/didactic/NAME.npz. The second half of this file draws the figures
 from these arrays; `experiments.figures` calls it.
 """

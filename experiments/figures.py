@@ -51,7 +51,8 @@ def read_runs(folder: Path) -> list[Run]:
     """Every run below `folder`, those on a GPU last and else by seed."""
     runs = []
     for file in folder.rglob("progress.csv"):
-        if rows := read_rows(file.parent):
+        ours = (file.parent / "config.json").exists()  # other programs write a progress.csv too
+        if ours and (rows := read_rows(file.parent)):
             columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
             saved = settings.load(file.parent)
             config = settings.complete(replace(saved, device="cpu"))

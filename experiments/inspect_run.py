@@ -59,6 +59,7 @@ def goals(parts: Parts) -> list[str]:
     achieved, tested = data["goal"], parts.original_buffer.episodes["desired_goal"]
     among = np.concatenate([achieved[rng.choice(order, AMONG)], rng.choice(tested, AMONG)])
     scale, cells = achieved[order].std(axis=0), []
+    scale[scale == 0] = 1  # a number that is the same in all
     for low, high in QUANTILES:
         i = rng.permutation(order[round(low * len(order)) : round(high * len(order))])[:AMONG]
         apart = np.stack([np.square((among - x) / scale).sum(axis=1) for x in achieved[i]])

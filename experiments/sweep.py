@@ -61,7 +61,7 @@ def seeds(text: str) -> list[int]:
 def all_runs(which: argparse.Namespace, given: argparse.Namespace) -> list[Config]:
     """The configs of what WHICH parsed, seeds last, so that the first of each is done before the
     second of any. UsageError if one of them cannot be run."""
-    common = {**settings(which.set), "num_workers": given.cores, "threads": given.cores}
+    common = {"num_workers": given.cores, "threads": given.cores, **settings(which.set)}
     runs = []
     for seed in which.seeds:
         for env in which.env:
@@ -99,9 +99,9 @@ def planned(file: Path, given: argparse.Namespace) -> list[Config]:
 def train_one(config: Config, here: str = ".") -> None:
     """Start the run, or go on with it if it was broken off. If it fails, error.txt in its folder
     says why. UsageError if the folder holds a run with other settings. here: what a relative folder
-    is relative to."""
+    is relative to, also after an environment has changed the working folder."""
     os.chdir(here)
-    folder = Path(config.out)
+    folder = Path(config.out).absolute()
     resume = (folder / "config.json").exists()
     note = folder / "error.txt"
     try:
@@ -117,6 +117,8 @@ def train_one(config: Config, here: str = ".") -> None:
         folder.mkdir(parents=True, exist_ok=True)
         note.write_text(traceback.format_exc())
         raise
+    finally:
+        os.chdir(here)
 
 
 def in_order(runs: list[Config]) -> dict:
@@ -198,7 +200,7 @@ WHICH.add_argument(
     help='one or more, each the settings that differ; "" is run.py\'s defaults (default: "")',
 )
 WHICH.add_argument("--set", default="", metavar="NAME=VALUE,...", help="for all runs")
-WHICH.add_argument("--seeds", type=seeds, default="0", help="such as 0-4 or 0,3 (default: 0)")
+WHICH.add_argument("--seeds", type=seeds, default=[0], help="such as 0-4 or 0,3 (default: 0)")
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -215,9 +217,14 @@ def main(argv: list[str] | None = None) -> None:
     try:
         if bool(given.plan) == bool(given.env):
             raise UsageError("one of --env and --plan is needed")
+        for name in ("variants", "set", "seeds", "gpus", "address") if given.plan else ():
+            if getattr(given, name) != parser.get_default(name):
+                raise UsageError(f"--{name} does not go with --plan")
+        here = os.getcwd()
         runs = planned(Path(given.plan), given) if given.plan else all_runs(given, given)
         for env, length in dict.fromkeys((config.env, config.episode_length) for config in runs):
             make_env(env, length).close()  # UsageError for one that cannot be learned in
+        os.chdir(here)  # which an environment may have changed
     except UsageError as error:
         parser.error(str(error))
     if given.list:

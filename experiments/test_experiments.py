@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import json
+import os
 import re
 import shutil
 import signal
@@ -108,6 +109,8 @@ def test_the_curves():
 
 def test_ones_own_runs_are_drawn(tmp_path, monkeypatch, capsys):
     make_run(tmp_path / "mine", epochs=1, env="FetchReach-v1", updates=2)
+    (tmp_path / "another").mkdir()  # another program's run
+    (tmp_path / "another" / "progress.csv").write_text("steps,loss\n1,2\n")
     monkeypatch.setattr(sys, "argv", ["figures", "all", "--runs", str(tmp_path)])
     figures.main()
     out, err = capsys.readouterr()
@@ -244,8 +247,8 @@ def test_statistics_by_hand():
     assert figures.interval(np.ones((4, 2))) is None  # too few: the seeds themselves
     assert figures.said(np.array([0.2496, -0.0004]), "+") == "+0.125 (+0.250 +0.000)"  # rounded
     assert figures.said(np.array([0.9996])) == "1.000"
-    low, high = figures.interval(np.full((12, 2), 0.7))
-    np.testing.assert_allclose([low, high], 0.7)
+    low, high = figures.interval(np.arange(12.0))  # standard error 1.0408
+    np.testing.assert_allclose([low, high], [5.5 - 2.262 * 1.0408, 5.5 + 2.262 * 1.0408], 1e-4)
 
 
 def test_the_figures_of_variances(tmp_path, monkeypatch, capsys):
@@ -349,6 +352,13 @@ def test_which_hindsight_has_goals_like_the_tested_ones(small_run, tmp_path, cap
     )
     shares = [float(x.rstrip("%")) for x in inspect_run.goals(parts)]
     np.testing.assert_allclose(shares, [0, 0, 91, 91], atol=8)
+    still = np.zeros((2 * n, 1))  # a number that is the same in all goals
+    b_h["goal"] = np.hstack([goal, still])
+    parts.original_buffer.episodes["desired_goal"] = np.hstack(
+        [rng.normal(9, 1, (n, 3)), still[:n]]
+    )
+    shares = [float(x.rstrip("%")) for x in inspect_run.goals(parts)]
+    np.testing.assert_allclose(shares, [0, 0, 91, 91], atol=8)
     assert len(printed("goals", small_run, capsys)) == 4
     with pytest.raises(SystemExit):
         make_run(tmp_path / "begun", epochs=0)
@@ -399,6 +409,8 @@ def test_what_a_sweep_consists_of():
     ]
     assert (runs[1].method, runs[1].heads, runs[1].epochs) == ("her", 1, 20)
     assert sweep.settings("heads=2,temperature=5") == {"heads": 2, "temperature": 5.0}
+    (config,) = asked_for("--env", "FetchReach-v1", "--set", "threads=3")
+    assert (config.threads, config.num_workers) == (3, 1)
 
 
 @pytest.mark.parametrize("wrong", ["--seeds many", "--seeds 5-1", "--variants colour=red"])
@@ -487,6 +499,29 @@ def test_a_run_that_fails_or_is_anothers_does_not_stop_the_others(plan, capsys, 
     assert epochs_done(first) == 3
     monkeypatch.setattr(sweep.run, "train", train)
     assert swept(arguments, capsys)[0] == 0 and not (broken / "error.txt").exists()
+
+
+@pytest.mark.parametrize("option", ["--seeds 1", "--set heads=2", "--variants x", "--gpus 1"])
+def test_a_plan_says_by_itself_what_is_run(option, plan, capsys):
+    with pytest.raises(SystemExit) as stop:
+        sweep.main([*plan[0], "--list", *option.split()])
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and f"{option.split()[0]} does not go with --plan" in err
+
+
+def test_an_environment_that_changes_the_folder_does_not_move_the_runs(
+    tmp_path, monkeypatch, capsys
+):
+    class Moves(Line):
+        def __init__(self, render_mode=None):
+            os.chdir("/")
+
+    gym.register("Moves-v0", Moves, max_episode_steps=10)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plan.txt").write_text(f'--env Moves-v0 --variants "" heads=2 --set {SMALL}')
+    code, out = swept(["--plan", "plan.txt"], capsys)
+    assert code == 0 and out.endswith("2 of 2 runs are whole\n")
+    assert len([*tmp_path.glob("runs/Moves-v0/*/seed0/checkpoint.pt")]) == 2
 
 
 @pytest.mark.slow

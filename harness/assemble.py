@@ -201,10 +201,6 @@ def restored(folder: Path) -> tuple[Parts, list[dict]]:
     config = replace(settings.load(folder), device="cpu")
     parts = assemble(settings.complete(config))
     rows = records.restore(folder, asdict(parts.config), parts)
-    if not rows and (epochs := records.epochs_done(folder)):
-        raise UsageError(
-            f"{folder} has {epochs} epochs in progress.csv and no {records.CHECKPOINT}"
-        )
     if not rows:
         raise UsageError(f"the run in {folder} has no whole epoch yet")
     return parts, rows

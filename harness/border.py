@@ -115,7 +115,7 @@ class Border(gym.Wrapper):
     def _reset(self, seed, options):
         obs, info = self.env.reset(seed=seed, options=options)
         self.compare(self.episode)
-        self.t = 0
+        self.t, self.ended = 0, False
         taken = self._taken(obs)
         self.episode = (np.array(obs["desired_goal"]), [], [])
         self._goal = taken["desired_goal"].tobytes()
@@ -145,9 +145,10 @@ class Border(gym.Wrapper):
         elif truncated:
             cut = f"it cut an episode off after {self.t} of {self.horizon} steps"
             raise self.failed(f"{cut}; try --episode-length {self.t}")
-        elif terminated and not success:
+        elif terminated and not (success or self.ended):
             ended = f"an episode ended in step {self.t} of {self.horizon} without success"
             raise self.failed(f"{ended}; episodes here have one length")
+        self.ended = self.ended or bool(terminated)  # some say so again in each later step
         return taken, reward, terminated, truncated, {**info, "is_success": bool(success)}
 
     def _taken(self, obs: dict) -> dict[str, np.ndarray]:

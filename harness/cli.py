@@ -22,9 +22,10 @@ def main(train: Callable, argv: list[str] | None = None) -> None:
     """Train, resume or play, as the arguments say. Exit code 2 and one line for bad input, 1 and
     one line for a run that something outside the program stopped, 130 for Ctrl-C."""
     sys.path.append(os.getcwd())  # for the user's own module:ID
-    for name in ("SIGTERM", "SIGHUP"):  # as Ctrl-C
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.default_int_handler)
+    for name in ("SIGTERM", "SIGHUP"):  # as Ctrl-C, but for what nohup has ignored
+        number = getattr(signal, name, None)
+        if number and signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)
     given, command = parse(argv)
     try:
         if command.play is not None:
@@ -108,6 +109,11 @@ def parse(argv: list[str] | None) -> tuple[dict, argparse.Namespace]:
             fail(f"--{name} needs a name, and was given none")
     if command.resume and command.play:
         fail("--resume and --play do not go together")
+    for name in given:
+        if command.play or (command.resume and name == "out"):
+            fail(
+                f"{settings.flag(name)} does not go with {'--play' if command.play else '--resume'}"
+            )
     for name in ("gif", "policy"):
         file = getattr(command, name)
         if file and not command.play:

@@ -62,11 +62,12 @@ def play(source: Path, gif: str | None = None, policy: str | None = None) -> np.
     if policy:
         write_policy(Path(policy), agent, best, about)
         print(f"{policy}: head {best}, {os.path.getsize(policy) // 1024} KB")
-    window = gif is None and (sys.platform in ("darwin", "win32") or "DISPLAY" in os.environ)
+    display = sys.platform in ("darwin", "win32") or "DISPLAY" in os.environ
+    window = gif is None and display and "human" in env.metadata.get("render_modes", ())
     if gif or window:
         show(about, agent, best, seeds[:SHOWN], gif)
     elif not policy:
-        print(f"no display; for an animation: {to_type('--play', source)} --gif FILE.gif")
+        print(f"no window; for an animation: {to_type('--play', source)} --gif FILE.gif")
     return rates
 
 

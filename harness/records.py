@@ -191,10 +191,12 @@ def read_checkpoint(path: Path) -> dict:
 
 def restore(folder: Path, config: dict, parts) -> list[dict]:
     """Bring the assemble.Parts to the state of the checkpoint. Returns its rows, none if there is
-    none yet. UsageError for a damaged one, and for one of another version or of other settings than
-    `config`, those aside that a resumed run may change."""
+    none yet. UsageError for a damaged one, for one of another version or of other settings than
+    `config`, those aside that a resumed run may change, and where rows are there without it."""
     path = folder / CHECKPOINT
     if not path.exists():
+        if epochs := epochs_done(folder):
+            raise UsageError(f"{folder} has {epochs} epochs in progress.csv and no {CHECKPOINT}")
         return []
     try:
         saved = read_checkpoint(path)

@@ -143,8 +143,8 @@ def examine(
 ) -> Task:
     """Make the environment and play an episode of random actions in it, and some more as long as
     the goal has not been reached in any. UsageError, one line, as in `make_env`, for all that
-    `Border` finds wrong, and for goals of a scale that the networks do not see; such observations
-    are a line on stderr. fits: called before anything is played; it may raise one too."""
+    `Border` finds wrong, and for goals of a scale that the networks do not see; single numbers of
+    such a scale are a line on stderr. fits: called before anything is played; it may raise too."""
     env = make_env(name, episode_length)
     space = env.observation_space
     task = Task(
@@ -200,7 +200,7 @@ def _played(env: Border) -> tuple[list[dict], bool]:
 
 def _look_at_the_scale(task: Task, rows: list[dict]) -> None:
     """EnvironmentFailed for goals that the networks cannot tell apart, a line for such
-    observations. The paper's own tasks, in which some numbers hardly move, are learned."""
+    numbers. The paper's own tasks, in which some numbers hardly move, are learned."""
     goals = np.array([row[key] for row in rows for key in ("achieved_goal", "desired_goal")])
     beyond, spread = np.abs(goals).max(axis=0) > CLIP, np.std(goals, axis=0, dtype=np.float64)
     if beyond.any():
@@ -211,15 +211,16 @@ def _look_at_the_scale(task: Task, rows: list[dict]) -> None:
         raise task.env.failed(f"its goals {where}, which the networks hardly see: use other units")
     if task.env.spec.id in PAPER_ENVS.values():
         return
-    obs = np.array([row["observation"] for row in rows], dtype=np.float64)
-    moves = np.ptp(obs, axis=0) > 0
-    clipped = moves & (np.ptp(obs.clip(-CLIP, CLIP), axis=0) == 0)
-    small = moves & (obs.std(axis=0) < FLOOR)
-    for which, how in ((clipped, f"only beyond ±{CLIP}"), (small, f"by less than {FLOOR}")):
-        if which.any():
-            numbers = ", ".join(map(str, np.flatnonzero(which)))
-            moving = f"number {numbers} of its observation moves {how}"
-            remark(f"{task.name}: {moving}, which the networks hardly see")
+    obs = np.array([row["observation"] for row in rows])
+    for name, x in (("observation", obs), ("goals", goals)):
+        moves = np.ptp(x, axis=0) > 0
+        clipped = moves & (np.ptp(x.clip(-CLIP, CLIP), axis=0) == 0)
+        small = moves & (np.std(x, axis=0, dtype=np.float64) < FLOOR)
+        for which, how in ((clipped, f"only beyond ±{CLIP}"), (small, f"by less than {FLOOR}")):
+            if which.any():
+                numbers = ", ".join(map(str, np.flatnonzero(which)))
+                moving = f"number {numbers} of its {name} moves {how}"
+                remark(f"{task.name}: {moving}, which the networks hardly see")
 
 
 def _describe(name: str, env: Border) -> str:

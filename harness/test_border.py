@@ -67,6 +67,12 @@ def saying(success):
     return lambda s, o, r, a, b, i: (o, r, a, b, {"is_success": success(r)})
 
 
+def ended_for_good(self, obs, reward, terminated, *more):
+    """Says so in each step after a success, whatever happens then."""
+    self.ended = reward == 0 or (self.t > 1 and self.ended)
+    return obs, reward, self.ended, *more
+
+
 def in_place(self, achieved_goal, desired_goal, info):
     """Works in what float32 goals are not copied into."""
     apart = np.asarray(desired_goal, np.float32)
@@ -128,6 +134,7 @@ LEARNED = [  # what is said of an environment, and another in which the same is 
     ("", odd(stepped=lambda s, o, r, *more: (o, np.array(r), *more)), PLAIN),
     ("", odd(stepped=lambda s, o, r, a, b, i: (o, r, a, b, {})), PLAIN),
     ("", odd(stepped=lambda s, o, r, a, b, i: (o, r, r == 0, s.t == 10, i)), PLAIN),
+    ("", odd(stepped=ended_for_good), PLAIN),
     ("", odd(stepped=saying(lambda r: 1.0 + r)), PLAIN),
     ("", odd(stepped=saying(lambda r: np.array([r == 0]))), PLAIN),
     ("", odd(observe=seeing(lambda s: [*s.x])), PLAIN),
@@ -142,6 +149,23 @@ LEARNED = [  # what is said of an environment, and another in which the same is 
         odd(observe=seeing(lambda s: s.x / 999)),
         None,
     ),
+]
+
+LEARNED += [
+    (
+        "1 of its goals moves by less than 0.01",
+        odd(
+            observation_space=spaces(
+                **{key: Box(-2, 2, (2,)) for key in ("achieved_goal", "desired_goal")}
+            ),
+            observe=lambda s: {
+                **Line.observe(s),
+                "achieved_goal": s.x * [1, 1e-3],
+                "desired_goal": s.g * [1, 1e-3],
+            },
+        ),
+        None,
+    )
 ]
 
 REFUSED = [  # before anything is written
@@ -454,8 +478,14 @@ def test_a_grown_observation_is_not_taken_for_a_damaged_checkpoint(tmp_path, cap
 def test_where_rows_are_there_and_no_checkpoint_that_is_said(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "run")
     (folder / records.CHECKPOINT).unlink()
-    with pytest.raises(UsageError, match=r"has 4 epochs in progress.csv and no checkpoint.pt"):
-        assemble.restored(folder)
+    before = (folder / "progress.csv").read_bytes()
+    for resumed_or_played in (
+        lambda: assemble.restored(folder),
+        lambda: train(Config(**SMALL, epochs=9, out=str(folder)), resume=True),
+    ):
+        with pytest.raises(UsageError, match=r"has 4 epochs in progress.csv and no checkpoint.pt"):
+            resumed_or_played()
+    assert (folder / "progress.csv").read_bytes() == before
 
 
 def test_memory_is_what_the_process_may_have(monkeypatch):

@@ -76,6 +76,16 @@ def test_nothing_is_left_running(sent, tmp_path):
     assert len(read_checkpoint(folder / "checkpoint.pt")["rows"]) >= 1
 
 
+def test_a_hangup_that_nohup_ignores_is_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with pytest.raises(SystemExit):
+            main(["--help"])
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 def test_a_nan_stops_the_run_and_says_where(tmp_path, monkeypatch):
     settings = {**SMALL, "env": "Broken-v0", "out": str(tmp_path / "run"), "epochs": 1}
     with pytest.raises(EnvironmentFailed, match="NaN or Inf in its observation after step 7"):
@@ -155,6 +165,8 @@ BAD = [
     ("--play full", "no whole epoch"),
     ("--gif a.gif", "--gif goes with --play"),
     ("--play full --resume full", "do not go together"),
+    ("--play full --eval-episodes 9", "--eval-episodes does not go with --play"),
+    ("--resume full --epochs 9 --out b", "--out does not go with --resume"),
 ]
 BAD += [
     (f"{option} {value}", f"{option} {words}" if words.startswith("must") else option)

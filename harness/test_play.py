@@ -101,6 +101,12 @@ def test_what_is_looked_at_ends_at_the_goal_and_what_is_counted_does_not():
     assert not success and len(frames) == 50
 
 
+def test_an_environment_without_a_window_is_played_on_a_desktop_too(whole, monkeypatch, capsys):
+    monkeypatch.setenv("DISPLAY", ":99")
+    play(whole)
+    assert "no window; for an animation" in capsys.readouterr().out
+
+
 def test_playing_takes_one_thread(whole, monkeypatch):
     """With more, each action waits for every core that is busy."""
     threads, before = set(), torch.get_num_threads()
