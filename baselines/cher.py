@@ -83,9 +83,9 @@ def select(
 class CHER(HERReplay):
     """For a mini-batch of S transitions, M = 2 S candidates as in HER, of which `select` keeps S.
 
-    λ = (1 + 10⁻⁴)^τ, where τ counts the updates of an epoch: it grows from 1, in 2,000 of
-    them to 1.22, and starts again. All heads of an ensemble update share a τ, so that it does not
-    grow K times as fast.
+    λ = (1 + 10⁻⁴)^τ, where τ counts the updates of an epoch: λ starts each epoch at 1 and is 1.22
+    after 2,000 updates. All heads of an ensemble update share a τ, so that λ does not grow K times
+    as fast.
 
     heads: K; updates: of all heads, in an epoch.
     """

@@ -1,9 +1,9 @@
 """Figures 3, 5 and 8, from runs on PointMassEmpty: python -m experiments.didactic
 
-Trains the runs below runs/didactic, or goes on with them (but for Figure 5's, of which it needs the
-epochs on the way), and writes what the figures need of their
-networks and buffers to results/didactic/NAME.npz. The second half of this file draws the figures
-from these arrays; `experiments.figures` calls it.
+Trains the runs below runs/didactic, or goes on with them, and writes what the figures need of their
+networks and buffers to results/didactic/NAME.npz. Figure 5 needs its runs at epochs 1, 4 and 10;
+one that is past such an epoch is refused. The second half of this file draws the figures from these
+arrays; `experiments.figures` calls it.
 """
 
 import argparse

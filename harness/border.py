@@ -148,7 +148,7 @@ class Border(gym.Wrapper):
         elif terminated and not (success or self.ended):
             ended = f"an episode ended in step {self.t} of {self.horizon} without success"
             raise self.failed(f"{ended}; episodes here have one length")
-        self.ended = self.ended or bool(terminated)  # some say so again in each later step
+        self.ended = bool(terminated)  # some go on saying so after a success
         return taken, reward, terminated, truncated, {**info, "is_success": bool(success)}
 
     def _taken(self, obs: dict) -> dict[str, np.ndarray]:

@@ -38,9 +38,9 @@ ABOUT = ("env", "episode_length", "method", "seed")  # what a policy says of its
 def play(source: Path, gif: str | None = None, policy: str | None = None) -> np.ndarray:
     """Play EPISODES test episodes with each head of a run's folder or with a policy's file, print
     the success rates, write the best head to the file `policy`, and show SHOWN episodes of it: in a
-    window where there is a display, or as the animation `gif`. Returns the success rate of each
-    head, (K,). UsageError if nothing was learned yet, for a file that is no policy, and for
-    pictures that cannot be drawn."""
+    window, if there is a display and the environment has a window, or as the animation `gif`.
+    Returns the success rate of each head, (K,). UsageError if nothing was learned yet, for a file
+    that is no policy, and for pictures that cannot be drawn."""
     source = source.absolute()  # an environment may change the working folder
     gif, policy = (file and str(Path(file).absolute()) for file in (gif, policy))
     agent, about = read_policy(source) if source.is_file() else of_run(source)

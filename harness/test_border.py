@@ -73,6 +73,11 @@ def ended_for_good(self, obs, reward, terminated, *more):
     return obs, reward, self.ended, *more
 
 
+def falls_later(self, obs, reward, terminated, truncated, info):
+    """Ends in step 2 by its word on success, and in step 9 by a fall."""
+    return obs, reward, self.t in (2, 9), truncated, {"is_success": self.t == 2}
+
+
 def in_place(self, achieved_goal, desired_goal, info):
     """Works in what float32 goals are not copied into."""
     apart = np.asarray(desired_goal, np.float32)
@@ -209,6 +214,7 @@ REFUSED = [  # before anything is written
     ("step 1 gave the reward -0.5$", odd(stepped=lambda s, o, r, *more: (o, -0.5, *more))),
     ("step 1 gave the reward nan$", odd(stepped=lambda s, o, r, *more: (o, np.nan, *more))),
     ("goal moved in step 3;", odd(observe=aiming(lambda s: s.g + s.t // 3))),
+    ("in step 9 of 10 without success", odd(stepped=falls_later)),
     ("in step 1 of 10 without success", odd(stepped=lambda s, o, r, a, b, i: (o, r, r < 0, b, i))),
     ("try --episode-length 5", odd(stepped=lambda s, o, r, a, b, i: (o, r, a, s.t == 5, i))),
     (r"\(10, 1\) goals gave \(3,\)", odd(rewarded=lambda s, r: r[:3] if r.ndim else r)),
