@@ -625,8 +625,7 @@ def test_point_mass_does_not_creep_into_the_wall(push):
     grow, and come out on the other side."""
     env = PointMass(wall=True)
     env.reset(seed=0)
-    env._xy = tuple(0.2 - 0.1414 * x / np.hypot(*push) for x in push)
-    env._xy = (env._xy[0], env._xy[1] - 0.2)
+    env._xy = tuple((0.2, 0) - 0.1414 * np.array(push) / np.hypot(*push))
     for _ in range(200):
         xy = env.step(push)[0]["achieved_goal"]
         assert distance_to_wall(xy[None])[0] >= 0.08 - 1e-12

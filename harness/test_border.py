@@ -154,9 +154,6 @@ LEARNED = [  # what is said of an environment, and another in which the same is 
         odd(observe=seeing(lambda s: s.x / 999)),
         None,
     ),
-]
-
-LEARNED += [
     (
         "1 of its goals moves by less than 0.01",
         odd(
@@ -170,7 +167,7 @@ LEARNED += [
             },
         ),
         None,
-    )
+    ),
 ]
 
 REFUSED = [  # before anything is written
