@@ -33,10 +33,17 @@ def mini_batch(rng, rows):
     return {**batch, "hindsight": rng.random(rows) < 0.8}
 
 
+def tensors(agent):
+    """The weights, the targets, and of each weight Adam's moments and its number of steps."""
+    state = agent.state_dict()
+    of_adam = [x for moments in state["optimizer"]["state"].values() for x in moments.values()]
+    return [x for net in state["networks"] for x in net] + of_adam
+
+
 @pytest.mark.parametrize("together", [1, 2, 4])
 def test_the_updates_are_those_of_the_ensemble(device, together):
-    """10 steps of each head, more than are taken before the capture, and the targets between. Later
-    the roundings grow, where a target passes a bound or a unit stops firing."""
+    """10 steps of each head, more than are taken before the capture, and the targets between. Each
+    begins with the same numbers: roundings grow, where they decide whether a unit fires."""
     plain, ours = EnsembleDDPG(**SIZES), EnsembleOnGPU(**SIZES, device=device)
     rng = np.random.default_rng(0)
     seen = rng.normal(size=(100, 7))
@@ -48,13 +55,13 @@ def test_the_updates_are_those_of_the_ensemble(device, together):
             heads = range(first, first + together)
             expected, losses = (agent.update_heads(heads, batches) for agent in (plain, ours))
             torch.testing.assert_close(losses.cpu(), expected, rtol=1e-4, atol=1e-5)
-        if i % 4 == 3:
-            plain.update_targets()
-            ours.update_targets()
-    weights = ([p for net in a._networks for p in net.trunk + net.stacks] for a in (plain, ours))
-    for expected, p in zip(*weights, strict=True):
-        difference = (p.cpu() - expected).abs()  # a step of Adam is 1e-3
-        assert difference.mean() < 1e-6 and difference.max() < 1e-3
+            if i % 4 == 3:
+                plain.update_targets()
+                ours.update_targets()
+            for expected, x in zip(tensors(plain), tensors(ours), strict=True):
+                # a step of Adam is 1e-3, and one of a target at least 5e-5
+                assert ((x.cpu() - expected).abs() > 1e-5).sum() <= 1 + 0.02 * x.numel()
+                x.copy_(expected)
     variances = [agent.q_variance(seen[:, :5], seen[:, :3], seen[:, 5:]) for agent in (plain, ours)]
     np.testing.assert_allclose(*variances, rtol=1e-2)
 
@@ -160,8 +167,10 @@ def test_what_was_drawn_before_is_not_handed_out_afterwards(device):
 
 @pytest.mark.parametrize(("method", "together"), [("vcp", 1), ("vcp", 4), ("her", 4)])
 def test_a_run_is_the_one_of_the_cpu(device, method, together, tmp_path, monkeypatch):
-    """Two epochs, the second one resumed; the CPU can go on with what it leaves."""
+    """Two epochs, the second one resumed; the CPU can go on with what it leaves. With larger steps
+    roundings grow, up to where another transition is drawn."""
     common = {**SMALL, "method": method, "epochs": 2, "heads": 4, "heads_at_once": together}
+    common["learning_rate"] = 1e-4
     run.train(Config(**common, out=str(tmp_path / "cpu"), device="cpu"))
     if device == "cpu":
         monkeypatch.setattr("harness.assemble.EnsembleDDPG", EnsembleOnGPU)
