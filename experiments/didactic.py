@@ -47,21 +47,38 @@ def trained(config: Config, epoch: int) -> Parts:
 
 def figure_3(config: Config) -> dict[str, np.ndarray]:
     """Section 5.3: the variance of a random state ŝ and its action with each achieved goal of its
-    own trajectory. xy (5, T+1, 2); t (5,), the step of ŝ; variance (5, T+1)."""
+    own trajectory, and the heads' mean value. xy (5, T+1, 2); t (5,), the step of ŝ; variance and
+    value (5, T+1). Section 5.4: both of all transitions of B_h, her_variance and her_value (N,).
+
+    The trajectories are those that move most among an episode of each head, with exploration."""
     parts = trained(config, EPOCH)
     agent, rng = parts.agent, np.random.default_rng(0)
+
+    def value(obs, goal):  # 1/K Σ_k Q_k(s, μ_k(s, g), g)
+        return agent.value(*(np.repeat(x[None], agent.num_heads, 0) for x in (obs, goal))).mean(0)
+
     with parts.envs() as envs:
         envs.reset(1_000_000)
         noise = run.exploration(rng, (50, 16, 2), 0.2, 0.3)
         episodes, _ = run.rollout(envs, run.acting_heads(agent, 16, 16, noise), 50)
     length = np.linalg.norm(np.diff(episodes["obs"], axis=1), axis=-1).sum(axis=1)
-    rows = np.argsort(-length)[:TRAJECTORIES]  # those that move most
+    rows = np.argsort(-length)[:TRAJECTORIES]
     t = rng.integers(50, size=TRAJECTORIES)
-    variance = []
+    variances, values = [], []
     for row, step in zip(rows, t, strict=True):
-        here = [np.repeat(episodes[k][row, [step]], 51, axis=0) for k in ("obs", "action")]
-        variance.append(agent.q_variance(*here, episodes["achieved_goal"][row]))
-    return {"xy": episodes["obs"][rows], "t": t, "variance": np.stack(variance)}
+        obs, action = (np.repeat(episodes[k][row, [step]], 51, axis=0) for k in ("obs", "action"))
+        goal = episodes["achieved_goal"][row]
+        variances.append(agent.q_variance(obs, action, goal))
+        values.append(value(obs, goal))
+    her = {name: x[: parts.her_buffer.size] for name, x in parts.her_buffer.data.items()}
+    return {
+        "xy": episodes["obs"][rows],
+        "t": t,
+        "variance": np.stack(variances),
+        "value": np.stack(values),
+        "her_variance": agent.q_variance(her["obs"], her["action"], her["goal"]),
+        "her_value": value(her["obs"], her["goal"]),
+    }
 
 
 def figure_5(config: Config) -> dict[str, np.ndarray]:
@@ -101,18 +118,18 @@ def figure_8(config: Config) -> dict[str, np.ndarray]:
 # ------------------------------------------------------------------------------ pictures
 
 
-def ranks(x: np.ndarray) -> np.ndarray:
-    return np.argsort(np.argsort(x)).astype(float)
+def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
+    """Spearman's, of two arrays (N,)."""
+    return float(np.corrcoef(*(np.argsort(np.argsort(a)) for a in (x, y)))[0, 1])
 
 
 def distance_correlation(data: dict[str, np.ndarray]) -> list[float]:
-    """Spearman's rank correlation between the distance of a goal from ŝ and the variance of the
-    pair, for each trajectory."""
-    result = []
-    for xy, t, variance in zip(data["xy"], data["t"], data["variance"], strict=True):
-        distance = np.linalg.norm(xy - xy[t], axis=1)
-        result.append(float(np.corrcoef(ranks(distance), ranks(variance))[0, 1]))
-    return result
+    """The rank correlation between the distance of a goal from ŝ and the variance of the pair, for
+    each trajectory."""
+    return [
+        rank_correlation(np.linalg.norm(xy - xy[t], axis=1), variance)
+        for xy, t, variance in zip(data["xy"], data["t"], data["variance"], strict=True)
+    ]
 
 
 def draw_figure_3(folder: Path) -> Figure:
@@ -122,22 +139,25 @@ def draw_figure_3(folder: Path) -> Figure:
     panels = list(fig.subplots(2, 3).flat)
     colour = np.log10(data["variance"])
     limits = {"vmin": colour.min(), "vmax": colour.max(), "cmap": "viridis"}
-    for ax, xy, t, variance, r in zip(
-        panels, data["xy"], data["t"], colour, distance_correlation(data), strict=False
+    with_value = [*map(rank_correlation, data["value"], data["variance"])]
+    for ax, xy, t, variance, r, q in zip(
+        panels, data["xy"], data["t"], colour, distance_correlation(data), with_value, strict=False
     ):
         ax.plot(*xy.T, color="0.8", linewidth=1, zorder=0)
         points = ax.scatter(*xy.T, c=variance, s=14, **limits)
         ax.plot(*xy[0], "o", color=RED, markersize=7, label="start")
         ax.plot(*xy[-1], "s", color=BLUE, markersize=7, label="end")
         ax.plot(*xy[t], "k^", markersize=9, label="ŝ")
-        ax.set_title(f"rank correlation {r:+.2f}", fontsize=10)
+        ax.set_title(f"{r:+.2f} with the distance, {q:+.2f} with Q", fontsize=9)
         ax.set(aspect="equal", xlim=(-0.62, 0.62), ylim=(-0.62, 0.62), xticks=[], yticks=[])
     panels[-1].axis("off")
     fig.legend(*fig.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     fig.colorbar(points, ax=fig.axes, shrink=0.8, label="log₁₀ of the variance")
+    in_buffer = rank_correlation(data["her_value"], data["her_variance"])
     fig.suptitle(
-        "Figure 3: variance of ŝ with each achieved goal of its trajectory and rank correlation\n"
-        "with the distance; PointMassEmptyEnv-v1, 5 updates of batch 64 a cycle, one seed",
+        "Figure 3: variance of ŝ with each achieved goal of its trajectory, and its rank\n"
+        f"correlation with distance and value ({in_buffer:+.2f} with the value in all of B_h);\n"
+        "PointMassEmptyEnv-v1, 5 updates of batch 64 a cycle, one seed",
         fontsize=10,
     )
     return fig
@@ -177,7 +197,7 @@ def draw_figure_5(folder: Path) -> Figure:
     fig.legend(*handles, loc="outside lower center", ncols=3, markerscale=5)
     fig.suptitle(
         "Figure 5: what is drawn, and its density (effective sample size); PointMassEmptyEnv-v1,\n"
-        "half originals, B_o of 10,000, 5 updates of batch 64 a cycle, one seed",
+        "half originals, B_o and B_h of 10,000, 5 updates of batch 64 a cycle, one seed",
         fontsize=10,
     )
     return fig
@@ -224,7 +244,7 @@ def main() -> None:
         return function(Config(**SCHEDULE, **settings, out=str(out / name)))
 
     half = {"relabel_ratio": 0.5}  # Sections 5.5 and 5.8
-    small = {**half, "buffer_size": 10_000}  # Figure 5's caption
+    small = {**half, "buffer_size": 10_000, "her_buffer_capacity": 10_000}  # Figure 5's caption
     try:
         arrays = {"fig3": arrays_of(figure_3, "heads16")}
         for k in SIZES:

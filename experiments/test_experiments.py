@@ -265,7 +265,8 @@ def test_the_figures_of_variances(tmp_path, monkeypatch, capsys):
     assert "has 2 epochs, not 1" in capsys.readouterr().err
     data = dict(np.load(tmp_path / "didactic" / "fig3.npz"))
     assert data["xy"].shape == (5, 51, 2) and data["variance"].shape == (5, 51)
-    assert (data["variance"] > 0).all()
+    assert (data["variance"] > 0).all() and data["value"].shape == (5, 51)
+    assert len(data["her_variance"]) == len(data["her_value"]) > 1000
     data = dict(np.load(tmp_path / "didactic" / "fig5_variance.npz"))
     assert {data[f"{kind}_2"].shape for kind in ("original", "her", "drawn")} == {(40, 4)}
     data = dict(np.load(tmp_path / "didactic" / "fig8_4.npz"))
