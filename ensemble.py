@@ -69,8 +69,8 @@ class MultiHeadMLP:
 
     @torch.no_grad()
     def all_heads(self, x: torch.Tensor, heads: slice = slice(None)) -> torch.Tensor:
-        """The chosen heads in one call. x is (K, E, I), rows of their own for each head, or (B, I),
-        the same rows for all; returns (K, E, J) or (K, B, J)."""
+        """n chosen heads in one call. x is (n, E, I), rows of their own for each head, or (B, I),
+        the same rows for all; returns (n, E, J) or (n, B, J)."""
         return self._forward([*self.trunk, *(p[heads] for p in self.stacks)], x)
 
     def _forward(self, params: list[torch.Tensor], x: torch.Tensor) -> torch.Tensor:
@@ -162,7 +162,7 @@ class EnsembleDDPG:
     @torch.no_grad()
     def act(self, obs: np.ndarray, goal: np.ndarray, heads: slice = slice(None)) -> np.ndarray:
         """Algorithm 2, line 7, without noise: a = μ_k(s, g) for all heads in one call.
-        obs (K, E, O) and goal (K, E, G) -> (K, E, A); `heads` picks those that act, K of them.
+        obs (n, E, O) and goal (n, E, G) -> (n, E, A) for the n heads that `heads` picks, else K.
         ValueError for rows of another number of heads."""
         acting = len(range(self.num_heads)[heads])
         if not (np.ndim(obs) == np.ndim(goal) == 3 and len(obs) == len(goal) == acting):

@@ -78,9 +78,9 @@ class PointMass(gym.Env):
     """PointMassEmptyEnv-v1 and PointMassWallEnv-v1: a circle in a walled room moves to a point.
 
     Appendix A: observation and achieved goal are the circle's centre (x, y), the goal is the point,
-    the action is the distance moved, 0.05 per unit in each axis. Success within 0.05. Start and
-    goal are uniform over the places where the circle's centre can be. The paper's is a MuJoCo model
-    with next to no inertia; this one has none, and needs no MuJoCo.
+    the action is the distance moved. The released code: 0.05 per unit of it in each axis, success
+    within 0.05, a MuJoCo model with next to no inertia; this one has none, and needs no MuJoCo.
+    Start and goal are uniform over the places where the circle's centre can be (ours).
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
@@ -151,7 +151,8 @@ class SparseReacher(ReacherEnv):
     """Reacher-v2 of the paper: MuJoCo's Reacher with a goal and the sparse reward of Eq. (1).
 
     Appendix A: the state is 8 numbers, cos and sin of the two joint angles, position and velocity
-    of the fingertip in x and y; the goal is the target's x and y. Success within 0.02.
+    of the fingertip in x and y; the goal is the target's x and y. Success within 0.02 is the
+    released code's.
     """
 
     threshold = 0.02

@@ -33,7 +33,7 @@ class EpisodeBuffer:
     ):
         if capacity < horizon:
             raise ValueError(f"a buffer of {capacity} transitions holds no episode of {horizon}")
-        self.capacity, self.size = capacity // horizon, 0  # in episodes
+        self.max_episodes, self.size = capacity // horizon, 0
         self.relabel_ratio, self.reward_fn = relabel_ratio, reward_fn
         shapes = {
             "obs": (horizon + 1, obs_dim),
@@ -41,7 +41,7 @@ class EpisodeBuffer:
             "desired_goal": (goal_dim,),
             "action": (horizon, action_dim),
         }
-        self._data = {k: np.empty((self.capacity, *s), np.float32) for k, s in shapes.items()}
+        self._data = {k: np.empty((self.max_episodes, *s), np.float32) for k, s in shapes.items()}
 
     @property
     def episodes(self) -> dict[str, np.ndarray]:
@@ -57,9 +57,9 @@ class EpisodeBuffer:
             shape, needed = np.shape(episodes[name]), (new, *array.shape[1:])
             if shape != needed:
                 raise ValueError(f'episodes["{name}"] is {shape}, and must be {needed}')
-        if new > self.capacity:
-            raise ValueError(f"{new} episodes do not fit into a buffer of {self.capacity}")
-        free = min(new, self.capacity - self.size)
+        if new > self.max_episodes:
+            raise ValueError(f"{new} episodes do not fit into a buffer of {self.max_episodes}")
+        free = min(new, self.max_episodes - self.size)
         slots = np.arange(self.size, self.size + free)
         if free < new:
             overwritten = rng.choice(self.size, new - free, replace=False)

@@ -559,7 +559,7 @@ def test_a_picture_shows_the_circle_where_it_is(name):
     [("PointMassEmptyEnv-v1", 0.05), ("PointMassWallEnv-v1", 0.05), ("SparseReacher-v1", 0.02)],
 )
 def test_success_is_within_the_threshold(name, within):
-    """A goal would count as reached within another distance than Appendix A's."""
+    """A goal would count as reached within another distance than the released code's."""
     env = gym.make(name, disable_env_checker=True).unwrapped
     achieved = np.array([[within - 1e-6, 0], [0, within + 1e-6]])
     assert env.compute_reward(achieved, np.zeros((2, 2)), {}).tolist() == [0, -1]
@@ -825,7 +825,7 @@ def test_the_same_seed_gives_the_same_rows_and_no_random_numbers_serve_twice(tmp
 @pytest.mark.parametrize(
     "options",
     [
-        {"priority": "uniform", "importance": "none"},
+        {"priority": "variance", "importance": "none"},
         {"priority": "variance", "importance": "inverse", "heads": 3, "temperature": 15.0},
         {"priority": "within-kind", "acting_head": "one"},
         {"heads": 1, "updates": 1, "scored_per_drawn": 4.0},

@@ -95,7 +95,7 @@ class DTGSH(HERReplay):
 
     The kernel is exp(-|g_i - g_j|² / 2σ²), with σ = 0.1 for the Hand and 0.5 elsewhere. Fetch's
     diversities are limited to 0.001. All of this is the original's, which has settings for Fetch
-    and Hand only.
+    and the Hand with an object; HandReach gets the Hand's.
     """
 
     def __init__(self, buffer: EpisodeBuffer, *, env_name: str, **at_once):
@@ -103,7 +103,7 @@ class DTGSH(HERReplay):
         self.sigma = 0.1 if env_name.startswith("Hand") else 0.5
         self.most = 0.001 if env_name.startswith("Fetch") else np.inf
         self.goal_part = goal_part(env_name)
-        self.diversity = np.zeros(self.buffer.capacity)
+        self.diversity = np.zeros(self.buffer.max_episodes)
         self.cumulative = np.empty(0)
 
     def new_episodes(self, slots: np.ndarray) -> None:

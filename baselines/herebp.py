@@ -13,7 +13,9 @@ from baselines.her import HERReplay
 from her import Batch, EpisodeBuffer, relabel_given
 
 GRAVITY = 9.81  # m/s²; masses are 1 kg and moments of inertia 1 kg·m²
-MOST_PER_STEP = {"Fetch": 0.5, "Hand": 2.5}  # J; the original's README, by the environment's name
+# J, by the environment's name: the original's README for FetchPickAndPlace and the Hand with an
+# object; here all of Fetch, and HandReach too
+MOST_PER_STEP = {"Fetch": 0.5, "Hand": 2.5}
 EPSILON = 1e-6  # J, so that episodes without any energy can be drawn too (ours)
 
 
@@ -65,7 +67,7 @@ class HEREBP(HERReplay):
         )
         self.settings = (dt, most_per_step)
         self.exponent = 1 / (temperature + 0.01)
-        self.energy = np.zeros(self.buffer.capacity)
+        self.energy = np.zeros(self.buffer.max_episodes)
         self.cumulative = np.empty(0)
 
     def new_episodes(self, slots: np.ndarray) -> None:

@@ -345,8 +345,8 @@ def test_where_nothing_moves_all_episodes_are_alike(method):
         ("Reacher-v2", 0.5, math.inf, math.inf),
     ],
 )
-def test_settings_are_the_originals(env_name, sigma, most_diversity, most_energy):
-    """A method would be compared with other settings than those of the original's authors."""
+def test_settings_are_the_originals_by_the_tasks_name(env_name, sigma, most_diversity, most_energy):
+    """A method would be compared with other settings than baselines/README.md says."""
     buffer = stored(np.float32(np.random.default_rng(0).normal(size=(4, 6, 3))))
     achieved = buffer.episodes["achieved_goal"]
     dtgsh, herebp = DTGSH(buffer, env_name=env_name), HEREBP(buffer, env_name=env_name, dt=DT)

@@ -7,6 +7,7 @@ quartiles behind them.
 """
 
 import argparse
+import math
 import os
 import subprocess
 import sys
@@ -21,7 +22,7 @@ import torch
 
 import run
 from ensemble import HIDDEN, EnsembleDDPG
-from harness.assemble import make_replay
+from harness.assemble import make_replay, number_of_envs
 from harness.numerics import begin_thread, for_training
 from harness.settings import Config, complete, variant
 from harness.tasks import examine, make_env
@@ -73,7 +74,7 @@ def filled(name: str, batch: int, transitions: int = 100_000) -> tuple:
     rng, (obs_dim, goal_dim, action_dim) = np.random.default_rng(0), SIZES[name]
     task, agent = examine(name), EnsembleDDPG(*SIZES[name], gamma=0.98)
     original = EpisodeBuffer(transitions, 50, *SIZES[name], 0.8, task.reward_fn)
-    n = original.capacity
+    n = original.max_episodes
     shapes = {"obs": (n, 51, obs_dim), "achieved_goal": (n, 51, goal_dim)}
     shapes |= {"desired_goal": (n, goal_dim), "action": (n, 50, action_dim)}
     original.add({k: rng.uniform(-1, 1, s).astype(np.float32) for k, s in shapes.items()}, rng)
@@ -174,13 +175,15 @@ def run_seconds(cycles: int, **given) -> tuple[float, float]:
         config = Config(**given, epochs=1, cycles=cycles, eval_episodes=16, out=f"{folder}/run")
         with redirect_stdout(null):
             (row,) = run.train(config)
-    # the warm-up is in collect_seconds too; the test here is a tenth of an epoch's
+    # the warm-up is in collect_seconds too; the test here is one round, as many episodes as there
+    # are environments, of an epoch's 160
     cycle = row["collect_seconds"] / (cycles + 1) + row["train_seconds"] / cycles
-    return cycle, 50 * cycle + 10 * row["eval_seconds"]
+    rounds = math.ceil(160 / number_of_envs(config))
+    return cycle, 50 * cycle + rounds * row["eval_seconds"]
 
 
 def bench_cores(repeats: int, cycles: int) -> None:
-    """The table of results/SPEED.md: a sweep, a cycle and an epoch by the number of cores."""
+    """A sweep, a cycle and an epoch by the number of cores."""
     if not hasattr(os, "sched_setaffinity"):
         print("\n3. By the number of cores: on Linux alone")
         return

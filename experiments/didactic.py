@@ -148,7 +148,7 @@ def draw_figure_3(folder: Path) -> Figure:
         ax.plot(*xy[0], "o", color=RED, markersize=7, label="start")
         ax.plot(*xy[-1], "s", color=BLUE, markersize=7, label="end")
         ax.plot(*xy[t], "k^", markersize=9, label="ŝ")
-        ax.set_title(f"{r:+.2f} with the distance, {q:+.2f} with Q", fontsize=9)
+        ax.set_title(f"distance {r:+.2f}, value {q:+.2f}", fontsize=9)
         ax.set(aspect="equal", xlim=(-0.62, 0.62), ylim=(-0.62, 0.62), xticks=[], yticks=[])
     panels[-1].axis("off")
     fig.legend(*fig.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)

@@ -17,9 +17,9 @@ from vcp import IMPORTANCE, PRIORITIES
 METHODS = ["vcp", "her", "herebp", "cher", "dtgsh"]
 GROUPS = {  # headings of --help, each by the first setting below it
     "env": "the run",
-    "epochs": "Appendix B: schedule, HER and DDPG",
-    "heads": "Section 4: VCP",
-    "method": "Section 5: comparisons and ablations",
+    "epochs": "schedule, HER and DDPG",
+    "heads": "VCP",
+    "method": "comparisons and ablations",
     "device": "the machine",
 }
 
@@ -42,9 +42,11 @@ class Config:
 
     epochs: int = setting(50, "epochs, M in Algorithm 2", least=1)
     cycles: int | None = setting(None, "collections an epoch, n (default: 5, 15 or 50)", least=1)
-    updates: int | None = setting(None, "updates of each head a cycle (default: 5 or 40)", least=1)
+    updates: int | None = setting(
+        None, "updates of each head a cycle (default: 5 or 40, dtgsh: 160)", least=1
+    )
     batch_size: int | None = setting(
-        None, "transitions in a head's mini-batch (default: 64 or 256)", least=1
+        None, "transitions in a head's mini-batch (default: 64 or 256, dtgsh: 64)", least=1
     )
     episode_length: int | None = setting(
         None, "steps of an episode, T (default: 50, or the environment's own)", least=1
@@ -61,7 +63,9 @@ class Config:
     action_penalty: float | None = setting(
         None, "weight of mean(μ²) in the actor's loss (default: 1, and 0.1 off the paper)", least=0
     )
-    eval_episodes: int = setting(160, "test episodes an epoch, as many for each head", least=1)
+    eval_episodes: int = setting(
+        160, "test episodes an epoch, rounded up to as many for each head", least=1
+    )
 
     heads: int = setting(16, "actors and critics, K", least=1)
     temperature: float = setting(
@@ -91,7 +95,7 @@ class Config:
         ["auto", "cpu", "cuda"],
     )
     threads: int | None = setting(
-        None, "threads that train and score (default: one a core)", least=1
+        None, "threads that train and score on the CPU (default: one a core)", least=1
     )
     num_workers: int | None = setting(
         None, "processes for the environments (default: one a core)", least=1
@@ -157,6 +161,9 @@ def complete(config: Config) -> Config:
     for name in OF_VCP if method != "vcp" else ():
         if getattr(config, name) != getattr(Config, name):
             raise UsageError(f"{flag(name)} goes with --method vcp, not with {method}")
+    for name in ("temperature", "importance") if config.priority == "uniform" else ():
+        if getattr(config, name) != getattr(Config, name):
+            raise UsageError(f"{flag(name)} changes nothing with --priority uniform")
     if method == "cher" and config.batch_size < 2:
         raise UsageError("--method cher selects from twice the batch: --batch-size 2 or more")
     if method == "vcp":

@@ -129,6 +129,11 @@ BAD = [
     ("--method her --importance none", "--importance goes with --method vcp"),
     ("--method dtgsh --scored-per-drawn 2", "--scored-per-drawn goes with --method vcp"),
     ("--method herebp --her-buffer-capacity 99999", "--her-buffer-capacity goes with --method vcp"),
+    ("--priority uniform --temperature 5", "--temperature changes nothing with --priority uniform"),
+    (
+        "--priority uniform --importance none",
+        "--importance changes nothing with --priority uniform",
+    ),
     ("--method cher --temperature 5", "--temperature goes with --method vcp"),
     ("--method cher --batch-size 1", "--batch-size 2 or more"),
     ("--nonsense", "--nonsense"),
