@@ -88,7 +88,7 @@ def train(config: Config, resume: bool = False) -> list[dict]:
                     slots = original_buffer.add(episodes, play_rng)  # 9: into B_o
                     # + HER+: the normaliser sees what the networks will, relabelled goals too
                     steps, ratio = num_envs * horizon, config.relabel_ratio
-                    seen = relabel_future(episodes, steps, play_rng, ratio, task.reward_fn)
+                    seen = relabel_future(episodes, steps, play_rng, ratio, task.compute_reward)
                     agent.normalizer.update(np.concatenate([seen["obs"], seen["goal"]], axis=1))
                     if not vcp:  # + another method's replay
                         replay.new_episodes(slots)

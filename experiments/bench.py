@@ -73,7 +73,7 @@ def filled(name: str, batch: int, transitions: int = 100_000) -> tuple:
     """An agent, a B_o of random episodes, and a B_h that was filled from it."""
     rng, (obs_dim, goal_dim, action_dim) = np.random.default_rng(0), SIZES[name]
     task, agent = examine(name), EnsembleDDPG(*SIZES[name], gamma=0.98)
-    original = EpisodeBuffer(transitions, 50, *SIZES[name], 0.8, task.reward_fn)
+    original = EpisodeBuffer(transitions, 50, *SIZES[name], 0.8, task.compute_reward)
     n = original.max_episodes
     shapes = {"obs": (n, 51, obs_dim), "achieved_goal": (n, 51, goal_dim)}
     shapes |= {"desired_goal": (n, goal_dim), "action": (n, 50, action_dim)}

@@ -19,7 +19,7 @@ from harness.border import Border
 from harness.errors import UsageError
 from harness.gpu import EnsembleOnGPU, HERBufferOnGPU
 from harness.settings import Config
-from harness.tasks import Task, before_training, examine, make_env
+from harness.tasks import before_training, examine, make_env
 from harness.workers import ParallelEnvs, available_cores, number_of_workers
 from her import EpisodeBuffer
 from vcp import HERBuffer
@@ -53,7 +53,7 @@ class Parts:
     """What `run.train` works with."""
 
     config: Config
-    task: Task
+    task: Border
     num_envs: int
     agent: EnsembleDDPG  # 𝔸
     original_buffer: EpisodeBuffer  # B_o
@@ -85,7 +85,7 @@ class Parts:
         config, workers = self.config, number_of_workers(self.config.num_workers, self.num_envs)
         # each half has the environments of whole heads, or of the only one
         halves = workers % 2 == 0 and (config.heads % 2 == 0 or config.heads == 1)
-        with closing(self.task.env):
+        with closing(self.task):
             with before_training():
                 parallel = ParallelEnvs(
                     config.env, self.num_envs, workers, halves, episode_length=config.episode_length
@@ -94,7 +94,7 @@ class Parts:
                 yield envs
 
 
-def memory_needed(config: Config, task: Task) -> int:
+def memory_needed(config: Config, task: Border) -> int:
     """Bytes that networks, buffers and a mini-batch of a run take when they are full, roughly."""
     # a transition of B_h, and of a mini-batch
     row = 4 * (2 * task.obs_dim + task.goal_dim + task.action_dim + 4)
@@ -113,7 +113,7 @@ def number_of_envs(config: Config) -> int:
     return config.heads * math.ceil(16 / config.heads)
 
 
-def refuse_what_does_not_fit(config: Config, task: Task) -> None:
+def refuse_what_does_not_fit(config: Config, task: Border) -> None:
     """UsageError for sizes that the memory or B_o does not hold."""
     if config.buffer_size < task.horizon:
         raise UsageError(f"--buffer-size must be {task.horizon} or more, to hold an episode")
@@ -134,7 +134,7 @@ def assemble(config: Config) -> Parts:
     task = examine(config.env, config.episode_length, partial(refuse_what_does_not_fit, config))
     if config.action_penalty != 1:
         penalty = f"action penalty {config.action_penalty:g} (1 is HER's, for the paper's tasks)"
-        task = replace(task, made=f"{task.made}; {penalty}")
+        task.made += f"; {penalty}"
     num_envs = number_of_envs(config)
     agent = make_agent(config, task)
     original_buffer = EpisodeBuffer(
@@ -144,14 +144,14 @@ def assemble(config: Config) -> Parts:
         task.goal_dim,
         task.action_dim,
         config.relabel_ratio,
-        task.reward_fn,
+        task.compute_reward,
     )
     replay = make_replay(config, task, original_buffer)
     her_buffer = replay if config.method == "vcp" else None
     return Parts(config, task, num_envs, agent, original_buffer, her_buffer, replay)
 
 
-def make_agent(config: Config, task: Task) -> EnsembleDDPG:
+def make_agent(config: Config, task: Border) -> EnsembleDDPG:
     """The off-policy algorithm 𝔸, with the networks' sizes for the task."""
     ensemble = EnsembleOnGPU if config.device == "cuda" else EnsembleDDPG
     return ensemble(
@@ -169,7 +169,7 @@ def make_agent(config: Config, task: Task) -> EnsembleDDPG:
 
 
 def make_replay(
-    config: Config, task: Task, original_buffer: EpisodeBuffer
+    config: Config, task: Border, original_buffer: EpisodeBuffer
 ) -> HERBuffer | HERReplay:
     """What Algorithm 2, line 15, draws from: B_h, or the replay of another method."""
     if config.method == "vcp":

@@ -71,6 +71,8 @@ class Border(gym.Wrapper):
         self.shapes = {key: env.observation_space[key].shape for key in KEYS}
         ends = np.cumsum([0, *(shape[0] for shape in self.shapes.values())])
         self.places = {key: slice(*ends[i : i + 2]) for i, key in enumerate(KEYS)}
+        self.obs_dim, self.goal_dim, _ = (shape[0] for shape in self.shapes.values())
+        self.action_dim = env.action_space.shape[0]
         # The Pen tasks' compute_reward gives something else for a batch than for a pair, in
         # gymnasium-robotics as in the gym of the paper (NOTES.md, "The Pen tasks' reward").
         self.is_pen = bool(asked(name, "class", getattr, env.unwrapped, PEN, False))

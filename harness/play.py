@@ -165,8 +165,8 @@ def read_policy(path: Path) -> tuple[EnsembleDDPG, dict]:
             arrays = dict(file)
         about = json.loads(str(arrays.pop("about")))
         env = make_env(about["env"], about["episode_length"])
-        sizes = [env.observation_space[name].shape[0] for name in ("observation", "desired_goal")]
-        agent = EnsembleDDPG(*sizes, *env.action_space.shape, gamma=0.98, num_heads=1)
+        sizes = env.obs_dim, env.goal_dim, env.action_dim
+        agent = EnsembleDDPG(*sizes, gamma=0.98, num_heads=1)
         env.close()
         tensors = {f"p{i}": p for i, p in enumerate(agent.actor.parameters())}
         tensors |= {name: getattr(agent.normalizer, name) for name in ("mean", "std")}

@@ -6,7 +6,6 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr
-from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 
@@ -16,7 +15,6 @@ from gymnasium.envs.registration import EnvSpec
 
 from harness.border import Border, asked, refuse_spaces, remark, said
 from harness.errors import EnvironmentFailed, UsageError
-from her import RewardFn
 
 try:
     # they print a notice about other environments
@@ -60,21 +58,6 @@ MISSPELT = {  # as Appendix A prints two of them
 MOST_LOOKED_AT = 8  # episodes, by `examine`
 CLIP, FLOOR = 200, 0.01  # what the networks can tell apart: see ensemble.Normalizer
 MOST_ROWS = 10_000  # steps, of which `examine` looks at the scale
-
-
-@dataclass(frozen=True)
-class Task:
-    """What the algorithm needs to know of an environment."""
-
-    name: str  # as `make_env` takes it
-    made: str  # one line: what that is today
-    horizon: int  # T
-    obs_dim: int
-    goal_dim: int
-    action_dim: int
-    dt: float  # seconds of a step; 1 where the environment does not say
-    reward_fn: RewardFn  # Eq. (1): (B, G) achieved and (B, G) desired goals -> (B,) of -1 and 0
-    env: Border  # which computes these rewards
 
 
 def make_env(
@@ -139,33 +122,23 @@ def _why(name: str, error: EnvironmentFailed) -> str:
 def examine(
     name: str,
     episode_length: int | None = None,
-    fits: Callable[[Task], None] = lambda task: None,
-) -> Task:
+    fits: Callable[[Border], None] = lambda task: None,
+) -> Border:
     """Make the environment and play an episode of random actions in it, and some more as long as
-    the goal has not been reached in any. UsageError, one line, as in `make_env`, for all that
-    `Border` finds wrong, and for goals of a scale that the networks do not see; single numbers of
-    such a scale are a line on stderr. fits: called before anything is played; it may raise too."""
+    the goal has not been reached in any; `made` says what it is. UsageError, one line, as in
+    `make_env`, for all that `Border` finds wrong, and for goals of a scale that the networks do not
+    see; single numbers of such a scale are a line on stderr. fits: called before anything is
+    played; it may raise too."""
     env = make_env(name, episode_length)
-    space = env.observation_space
-    task = Task(
-        name=name,
-        made=_describe(name, env),
-        horizon=env.horizon,
-        obs_dim=space["observation"].shape[0],
-        goal_dim=space["desired_goal"].shape[0],
-        action_dim=env.action_space.shape[0],
-        dt=env.dt,
-        reward_fn=env.compute_reward,
-        env=env,
-    )
     with ExitStack() as unless_all_is_well, before_training():
         unless_all_is_well.callback(env.close)
-        fits(task)
+        fits(env)
         rows, seeded = _played(env)
-        _look_at_the_scale(task, rows)
+        _look_at_the_scale(env, rows)
         unless_all_is_well.pop_all()
     unseeded = "" if seeded else "; it does not follow its seed, so that runs differ"
-    return replace(task, made=task.made + unseeded)
+    env.made = _describe(name, env) + unseeded
+    return env
 
 
 def _played(env: Border) -> tuple[list[dict], bool]:
@@ -198,18 +171,18 @@ def _played(env: Border) -> tuple[list[dict], bool]:
     return rows, all(np.array_equal(a[key], b[key]) for a, b in pairs for key in a)
 
 
-def _look_at_the_scale(task: Task, rows: list[dict]) -> None:
+def _look_at_the_scale(env: Border, rows: list[dict]) -> None:
     """EnvironmentFailed for goals that the networks cannot tell apart, a line for such
     numbers. The paper's own tasks, in which some numbers hardly move, are learned."""
     goals = np.array([row[key] for row in rows for key in ("achieved_goal", "desired_goal")])
     beyond, spread = np.abs(goals).max(axis=0) > CLIP, np.std(goals, axis=0, dtype=np.float64)
     if beyond.any():
         where = f"lie beyond ±{CLIP} (number {beyond.argmax()})"
-        raise task.env.failed(f"its goals {where}, all the same to the networks: use other units")
+        raise env.failed(f"its goals {where}, all the same to the networks: use other units")
     if 0 < spread.max() < FLOOR:
         where = f"differ by {spread.max():.1g} at most"
-        raise task.env.failed(f"its goals {where}, which the networks hardly see: use other units")
-    if task.env.spec.id in PAPER_ENVS.values():
+        raise env.failed(f"its goals {where}, which the networks hardly see: use other units")
+    if env.spec.id in PAPER_ENVS.values():
         return
     obs = np.array([row["observation"] for row in rows])
     for name, x in (("observation", obs), ("goals", goals)):
@@ -220,7 +193,7 @@ def _look_at_the_scale(task: Task, rows: list[dict]) -> None:
             if which.any():
                 numbers = ", ".join(map(str, np.flatnonzero(which)))
                 moving = f"number {numbers} of its {name} moves {how}"
-                remark(f"{task.name}: {moving}, which the networks hardly see")
+                remark(f"{env.name}: {moving}, which the networks hardly see")
 
 
 def _describe(name: str, env: Border) -> str:

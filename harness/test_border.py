@@ -276,7 +276,7 @@ def test_what_makes_no_difference_or_one_line(line, env, like, capfd):
     if like:
         np.testing.assert_equal(played(env), played(like))
     for _ in range(2):
-        examine(env).env.close()
+        examine(env).close()
     err = capfd.readouterr().err
     assert err.count("\n") == bool(line) and line in err and env in (err or env)
 
@@ -501,7 +501,9 @@ def test_memory_is_what_the_process_may_have(monkeypatch):
 
 def test_what_does_not_fit_into_the_memory_is_refused():
     task, config = examine(PLAIN), complete(Config())
-    less, more = (assemble.memory_needed(config, replace(task, horizon=t)) for t in (10, 1010))
+    less = assemble.memory_needed(config, task)
+    task.horizon = 1010
+    more = assemble.memory_needed(config, task)
     assert more - less == 2 * 16 * 1000 * 4 * 3  # two collections by 16 environments
     with pytest.raises(UsageError, match=r"GB are needed .* lower --heads, --batch-size"):
         assemble.refuse_what_does_not_fit(complete(Config(buffer_size=10**13)), task)
