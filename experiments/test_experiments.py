@@ -567,7 +567,7 @@ def test_a_sweep_that_is_told_to_stop_while_it_imports_ends_with_its_line(name, 
         ("--seeds 0-2", "line 2: no --env"),
         ('--env "PointMass', "line 2: No closing quotation"),
         ("--env PointMassEmptyEnv-v1 --seeds many", "line 2: argument --seeds"),
-        ("--env Nowhere-v0", "cannot make the environment Nowhere-v0"),
+        ("--env Nowhere-v0", "cannot learn in the environment Nowhere-v0"),
     ],
 )
 def test_a_plan_of_what_cannot_be_run_is_refused(line, message, tmp_path, capsys):

@@ -1,6 +1,5 @@
 """The tasks: the paper's sixteen names (Appendix A), and any other goal environment."""
 
-import difflib
 import io
 import os
 import sys
@@ -78,11 +77,8 @@ def make_env(
     if spec is not None and ":" not in made:
         gym.registry.setdefault(spec.id, spec)
     how = {"max_episode_steps": length, "disable_env_checker": True, **kwargs}
-    try:
-        env = asked(name, "constructor", gym.make, made, **how)
-    except EnvironmentFailed as error:
-        raise UsageError(f"cannot make the environment {name}: {_why(name, error)}") from error
     with before_training():
+        env = asked(name, "constructor", gym.make, made, **how)
         asked(name, "spaces", refuse_spaces, env, name)
         box = env.action_space
         if not (np.all(box.low == -1) and np.all(box.high == 1)):
@@ -102,21 +98,6 @@ def before_training() -> Iterator[None]:
         raise UsageError(f"cannot learn in the environment {error}") from error
     except (MemoryError, OSError) as error:
         raise UsageError(f"the run cannot be set up: {said(error)}") from error
-
-
-def _why(name: str, error: EnvironmentFailed) -> str:
-    """Why an environment was not made, with the names that are nearest, or the module that was
-    looked into."""
-    cause = error.__cause__
-    if not isinstance(cause, (gym.error.Error, ModuleNotFoundError)):
-        return f"its constructor raised {said(cause)}"
-    message = said(cause).partition(": ")[2]
-    if module := sys.modules.get(name.rpartition(":")[0]):
-        return f"{message}; the module is {module.__file__}: if that is not yours, rename yours"
-    ids = [i for i, spec in gym.registry.items() if "obotics" in str(spec.entry_point)]
-    close = difflib.get_close_matches(name, {*PAPER_ENVS, *ids}, n=3, cutoff=0.5)
-    known = isinstance(cause, gym.error.Error) and close
-    return message + (f"; the nearest names are {', '.join(close)}" if known else "")
 
 
 def examine(

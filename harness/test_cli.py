@@ -119,12 +119,12 @@ LIMITS = {
 WORDS = {words: pairs.split() for words, pairs in LIMITS.items()}
 
 BAD = [
-    ("--env FetchRech-v1", "FetchReach-v1"),
+    ("--env FetchRech-v1", "Did you mean: `FetchReach`?"),
     ("--env CartPole-v1", "no goals"),
     ("--env FetchReach-v2", "FetchReach-v4"),
     ("--env FetchReachDense-v4", "-1 and 0"),
     ("--env nowhere:Env-v0", "nowhere"),
-    ("--env=", "cannot make"),
+    ("--env=", "Malformed environment ID"),
     ("--method her --priority variance", "--priority goes with --method vcp"),
     ("--method her --importance none", "--importance goes with --method vcp"),
     ("--method dtgsh --scored-per-drawn 2", "--scored-per-drawn goes with --method vcp"),
@@ -146,9 +146,9 @@ BAD = [
     ("--batch-size 1000000000", "lower --heads, --batch-size"),
     ("--buffer-size 100000000000", "lower --heads, --batch-size, --buffer-size"),
     ("--batch 16", "--batch"),
-    ("--env a:b:c-v0", "cannot make the environment a:b:c-v0"),
-    ("--env ../x:Y", "cannot make the environment ../x:Y"),
-    ("--env :X", "cannot make the environment :X"),
+    ("--env a:b:c-v0", "cannot learn in the environment a:b:c-v0"),
+    ("--env ../x:Y", "cannot learn in the environment ../x:Y"),
+    ("--env :X", "cannot learn in the environment :X"),
     ("--env broken_module:Own-v0", "SyntaxError"),
     ("--resume=", "--resume needs a name"),
     ("--play=", "--play needs a name"),

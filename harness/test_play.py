@@ -64,7 +64,7 @@ def test_a_policy_acts_as_the_best_head_and_plays_without_the_run(
 
 def test_a_damaged_policy_or_one_of_another_task_is_refused(whole, tmp_path):
     file, (agent, _) = tmp_path / "policy.npz", module.of_run(whole)
-    for env, message in (("x", "cannot make the environment x"), ("FetchReach-v1", "no policy")):
+    for env, message in (("x", "in the environment x"), ("FetchReach-v1", "no policy")):
         module.write_policy(file, agent, 0, {"env": env, "episode_length": None})
         with pytest.raises(UsageError, match=message):
             read_policy(file)

@@ -7,7 +7,6 @@ import sys
 import numpy as np
 import pytest
 
-from harness.errors import UsageError
 from harness.tasks import PAPER_ENVS, examine, make_env
 from harness.testing import HERE
 
@@ -60,32 +59,11 @@ def test_what_is_said_of_a_task(name, made, dt, capfd):
     assert task.made == f"{made} an episode" and task.dt == dt and capfd.readouterr().err == ""
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("FetchReach-v9", "the nearest names are .*FetchReach-v4"),
-        ("PointMasWallEnv-v1", "the nearest names are .*PointMassWallEnv-v1"),
-        ("FetchReach-v2", "FetchReach-v4"),  # deprecated
-        ("no_such_module:Env-v0", "no_such_module"),
-        ("", "cannot make"),
-    ],
-)
-def test_names_that_cannot_be_made(name, message):
-    with pytest.raises(UsageError, match=message) as error:
-        make_env(name)
-    assert "\n" not in str(error.value)
-
-
 def test_a_module_and_its_id_name_an_environment(tmp_path, monkeypatch):
     line = "gymnasium.register('Own-v0', harness.testing.Line, max_episode_steps=5)"
     (tmp_path / "own_module.py").write_text(f"import gymnasium, harness.testing\n{line}\n")
     monkeypatch.syspath_prepend(tmp_path)
     assert make_env("own_module:Own-v0").spec.max_episode_steps == 5
-
-
-def test_a_module_that_is_called_like_one_of_the_projects_is_named():
-    with pytest.raises(UsageError, match=rf"the module is {HERE / 'her.py'}: if that is not yours"):
-        make_env("her:Mine-v0")
 
 
 def test_a_renderer_that_is_not_there_is_one_line():
