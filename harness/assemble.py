@@ -115,8 +115,6 @@ def number_of_envs(config: Config) -> int:
 
 def refuse_what_does_not_fit(config: Config, task: Border) -> None:
     """UsageError for sizes that the memory or B_o does not hold."""
-    if config.buffer_size < task.horizon:
-        raise UsageError(f"--buffer-size must be {task.horizon} or more, to hold an episode")
     needed, there = memory_needed(config, task), memory()
     if needed > there:
         sizes = "--heads, --batch-size, --buffer-size or --episode-length"

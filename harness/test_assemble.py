@@ -34,12 +34,6 @@ def test_a_thread_a_core_or_as_many_as_are_asked_for(monkeypatch):
         assert parts.threads() == made
 
 
-def test_a_buffer_too_small_for_what_is_collected_is_refused():
-    for size, message in ((49, "50 or more"), (799, "hold 16 episodes of 50 steps")):
-        with pytest.raises(UsageError, match=message):
-            assemble(complete(Config(env="PointMassEmptyEnv-v1", buffer_size=size)))
-
-
 @pytest.mark.parametrize(
     ("heads", "workers", "halves"), [(2, 1, 1), (2, 2, 2), (1, 2, 2), (3, 2, 1), (4, 4, 2)]
 )

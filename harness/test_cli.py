@@ -140,7 +140,7 @@ BAD = [
     ("--heads-at-once 3", "--heads-at-once must divide the"),
     ("--scored-per-drawn 0.00001", "--scored-per-drawn must be"),
     ("--her-buffer-capacity 9", "are scored at once, and B_h holds 9"),
-    ("--buffer-size 49", "--buffer-size must be 50 or more"),
+    ("--buffer-size 799", "--buffer-size must hold 16 episodes of 50 steps"),
     ("--seed 18446744073709551616", "--seed must be 4294967295 or less"),
     ("--heads 10000000", "lower --heads"),
     ("--batch-size 1000000000", "lower --heads, --batch-size"),
