@@ -25,9 +25,9 @@ from hypothesis.extra.numpy import arrays
 import run
 from ensemble import HIDDEN, EnsembleDDPG, Normalizer
 from envs_point import PointMass
-from harness.records import COLUMNS
 from harness.tasks import make_env
 from harness.testing import (
+    COLUMNS,
     SMALL_TRAINING,
     assert_drawn_as_in_her,
     assert_frequencies,

@@ -22,10 +22,10 @@ from experiments import didactic, figures, inspect_run, sweep
 from harness import settings
 from harness.assemble import restored
 from harness.errors import UsageError
-from harness.records import COLUMNS, epochs_done
+from harness.records import epochs_done
 from harness.settings import METHODS, Config
 from harness.tasks import PAPER_ENVS
-from harness.testing import HERE, Line, finish, start, wait_for_an_epoch
+from harness.testing import COLUMNS, HERE, Line, finish, start, wait_for_an_epoch
 from run import train
 from vcp import value_consistency_priority
 

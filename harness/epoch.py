@@ -67,9 +67,9 @@ class Epoch:
             "actor_loss": actor_loss,
             **variance_by_kind(agent, replay),
             "batch_original_fraction": float(sum(self.originals) / len(self.originals)),
-            "loss_original_fraction": float(sum(self.original_weights) / len(self.originals)),
             "her_buffer_size": replay.size,
             **{f"{name}_seconds": value for name, value in self.seconds.items()},
+            "loss_original_fraction": float(sum(self.original_weights) / len(self.originals)),
         }
 
     def write(self, row: dict) -> None:

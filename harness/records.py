@@ -24,25 +24,6 @@ from filelock import FileLock, Timeout
 
 from harness.errors import FolderInUse, UsageError
 
-COLUMNS = [
-    "epoch",
-    "env_steps",
-    "wall_seconds",
-    "test_success_rate",
-    "train_success_rate",
-    "test_q",
-    "critic_loss",
-    "actor_loss",
-    "variance_hindsight",
-    "variance_original",
-    "batch_original_fraction",
-    "her_buffer_size",
-    "collect_seconds",
-    "train_seconds",
-    "eval_seconds",
-    "loss_original_fraction",
-]
-TIMING_COLUMNS = {name for name in COLUMNS if name.endswith("_seconds")}
 PACKAGES = ("numpy", "torch", "gymnasium", "gymnasium-robotics", "mujoco")
 CHECKPOINT = "checkpoint.pt"
 FORMAT = 7  # of checkpoints; others are refused
@@ -112,7 +93,8 @@ def begin(folder: Path, config: dict, parts, resume: bool) -> list[dict]:
     rows = restore(folder, config, parts) if resume else []
     if len(rows) < config["epochs"]:
         write_config(folder, config)
-    write_rows(folder, rows, config)
+    if rows:
+        write_rows(folder, rows, config)
     return rows
 
 
@@ -141,14 +123,13 @@ def as_tensors(state):
 
 
 def write_rows(folder: Path, rows: list[dict], config: dict) -> None:
-    """progress.csv and, if there are rows, curve.png."""
+    """progress.csv, with the columns of `Epoch.row`, and curve.png."""
     text = io.StringIO(newline="")
-    table = csv.DictWriter(text, COLUMNS)
+    table = csv.DictWriter(text, rows[0])
     table.writeheader()
     table.writerows(rows)
     write_whole(folder / "progress.csv", lambda file: file.write(text.getvalue().encode()))
-    if rows:
-        _draw_curve(folder, rows, config)
+    _draw_curve(folder, rows, config)
 
 
 def read_rows(folder: Path) -> list[dict[str, float]]:
