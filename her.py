@@ -80,6 +80,8 @@ def relabel_future(
     rng: np.random.Generator,
     relabel_ratio: float,
     reward_fn: RewardFn,
+    e: np.ndarray | None = None,
+    t: np.ndarray | None = None,
 ) -> Batch:
     """Section 3.2 and Algorithm 1, lines 3-4: draw transitions, replace goals by achieved ones.
 
@@ -87,28 +89,17 @@ def relabel_future(
     relabel_ratio: probability that a transition gets a new goal. HER's k = 4 additional goals
         (Appendix B) is the ratio k/(1+k) = 0.8; nothing is stored k times.
     reward_fn: Eq. (1), vectorised: (B, G) achieved and (B, G) desired goals -> (B,) of -1 and 0.
+    e, t: the episode and the step of each transition, (B,); else all are drawn alike.
     Returns obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,) and hindsight (B,),
         a bool.
     FloatingPointError for a reward that is NaN or Inf; ValueError for rewards of another shape or
         beyond -1 and 0, by which `EnsembleDDPG` clips its targets.
     """
     n, horizon = episodes["action"].shape[:2]
-    e = rng.integers(n, size=batch_size)
-    t = rng.integers(horizon, size=batch_size)  # 0 .. T-1
-    return relabel_given(episodes, e, t, rng, relabel_ratio, reward_fn)
-
-
-def relabel_given(
-    episodes: dict[str, np.ndarray],
-    e: np.ndarray,
-    t: np.ndarray,
-    rng: np.random.Generator,
-    relabel_ratio: float,
-    reward_fn: RewardFn,
-) -> Batch:
-    """`relabel_future` for given transitions (Section 3.2): the steps t (B,) of episodes e (B,)."""
-    achieved, horizon = episodes["achieved_goal"], episodes["action"].shape[1]
-    hindsight = rng.random(len(e)) < relabel_ratio
+    e = rng.integers(n, size=batch_size) if e is None else e
+    t = rng.integers(horizon, size=batch_size) if t is None else t  # 0 .. T-1
+    achieved = episodes["achieved_goal"]
+    hindsight = rng.random(batch_size) < relabel_ratio
     future = rng.integers(t + 1, horizon + 1)  # t' ~ U{t+1, ..., T}
     goal = np.where(hindsight[:, None], achieved[e, future], episodes["desired_goal"][e])
     # r(s, a, g) asks whether the action led to the goal, so it reads the NEXT achieved goal.

@@ -11,7 +11,7 @@ Letters in the shape comments:
 import numpy as np
 
 from baselines.her import HERReplay, goal_part
-from her import Batch, EpisodeBuffer, relabel_given
+from her import Batch, EpisodeBuffer, relabel_future
 
 GROWTH = 1e-4  # of λ, with each update
 TRIO = 3  # candidates that are looked at for one to be taken
@@ -100,10 +100,10 @@ class CHER(HERReplay):
     def draw(self, count: int, batch_size: int, rng: np.random.Generator) -> Batch:
         episodes, candidates = self.buffer.episodes, 2 * batch_size
         n, horizon = episodes["action"].shape[:2]
-        e = rng.integers(n, size=count * candidates)
-        t = rng.integers(horizon, size=count * candidates)
+        size = count * candidates
+        e, t = rng.integers(n, size=size), rng.integers(horizon, size=size)
         ratio, reward_fn = self.buffer.relabel_ratio, self.buffer.reward_fn
-        batch = relabel_given(episodes, e, t, rng, ratio, reward_fn)
+        batch = relabel_future(episodes, size, rng, ratio, reward_fn, e, t)
 
         def by_batch(x):
             return x[:, self.goal_part].reshape(count, candidates, -1)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from baselines.her import HERReplay, goal_part
-from her import Batch, EpisodeBuffer, relabel_given
+from her import Batch, EpisodeBuffer, relabel_future
 
 CANDIDATES = 100 / 64  # for each that is selected
 SMALLEST = 1e-12  # an eigenvalue's share of the largest; below it is rounding
@@ -117,12 +117,11 @@ class DTGSH(HERReplay):
 
     def draw(self, count: int, batch_size: int, rng: np.random.Generator) -> Batch:
         episodes, candidates = self.buffer.episodes, round(CANDIDATES * batch_size)
-        u = rng.random(count * candidates)
-        e = np.searchsorted(self.cumulative, u, side="right")
-        t = rng.integers(episodes["action"].shape[1], size=count * candidates)
+        size = count * candidates
+        e = np.searchsorted(self.cumulative, rng.random(size), side="right")
         # As many original goals among the candidates as there are in a mini-batch of HER.
         relabel_ratio = 1 - batch_size * (1 - self.buffer.relabel_ratio) / candidates
-        batch = relabel_given(episodes, e, t, rng, relabel_ratio, self.buffer.reward_fn)
+        batch = relabel_future(episodes, size, rng, relabel_ratio, self.buffer.reward_fn, e)
 
         g = batch["goal"][:, self.goal_part].reshape(count, candidates, -1).astype(np.float64)
         square = np.square(g).sum(axis=-1)  # |g_i - g_j|² = |g_i|² + |g_j|² - 2 g_i·g_j

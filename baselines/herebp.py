@@ -10,7 +10,7 @@ Letters in the shape comments:
 import numpy as np
 
 from baselines.her import HERReplay
-from her import Batch, EpisodeBuffer, relabel_given
+from her import Batch, EpisodeBuffer, relabel_future
 
 GRAVITY = 9.81  # m/s²; masses are 1 kg and moments of inertia 1 kg·m²
 # J, by the environment's name: the original's README for FetchPickAndPlace and the Hand with an
@@ -82,5 +82,5 @@ class HEREBP(HERReplay):
         episodes, size = self.buffer.episodes, count * batch_size
         # Inverse transform sampling: the first e with p_1 + ... + p_e > u.
         e = np.searchsorted(self.cumulative, rng.random(size), side="right")
-        t = rng.integers(episodes["action"].shape[1], size=size)
-        return relabel_given(episodes, e, t, rng, self.buffer.relabel_ratio, self.buffer.reward_fn)
+        ratio, reward_fn = self.buffer.relabel_ratio, self.buffer.reward_fn
+        return relabel_future(episodes, size, rng, ratio, reward_fn, e)
