@@ -4,6 +4,7 @@ Either it learns what `Line` learns, or one line says what is wrong: before anyt
 with exit code 2, or with 1 once training has begun.
 """
 
+import multiprocessing
 import os
 import random
 import re
@@ -11,6 +12,7 @@ import resource
 import shutil
 import sys
 import tempfile
+import threading
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -231,6 +233,11 @@ REFUSED = [  # before anything is written
 STOPPED = [  # once training has begun: in the second episode or the first
     ("ended in step 1 of", odd(stepped=lambda s, o, r, a, b, i: (o, r, s.unseeded > 2, b, {}))),
     ("step raised SystemExit: 3", odd(rewarded=lambda s, r: r if s.unseeded < 2 else sys.exit(3))),
+    (
+        "NaN or Inf in its desired_goal",
+        odd(observe=aiming(lambda s: s.g * (1 if s.unseeded < 3 else np.inf))),
+    ),
+    ("gave nan", odd(rewarded=lambda s, r: r * (1 if r.ndim < 1 or s.unseeded < 2 else np.nan))),
 ]
 
 
@@ -311,6 +318,7 @@ def test_what_only_comes_later_stops_the_run(workers, message, env, tmp_path, ca
     code, _, err = ended(capfd, *arguments(env, tmp_path / "run", workers))
     assert code == 1 and err.startswith(f"run.py: stopped in epoch 1: {env}: ")
     assert err.count("\n") == 1 and re.search(message, err), err
+    assert not multiprocessing.active_children() and threading.active_count() == 1
 
 
 @pytest.mark.parametrize(

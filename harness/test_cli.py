@@ -5,7 +5,6 @@ import os
 import re
 import shlex
 import signal
-import threading
 import time
 from pathlib import Path
 
@@ -15,7 +14,6 @@ import pytest
 import run
 from ensemble import EnsembleDDPG
 from harness import records
-from harness.errors import EnvironmentFailed
 from harness.records import read_checkpoint
 from harness.testing import ARGUMENTS, HERE, SMALL, command, finish, main, start, wait_for_an_epoch
 from run import Config
@@ -88,16 +86,9 @@ def test_a_hangup_that_nohup_ignores_is_ignored():
 
 
 def test_a_nan_stops_the_run_and_says_where(tmp_path, monkeypatch):
-    settings = {**SMALL, "env": "Broken-v0", "out": str(tmp_path / "run"), "epochs": 1}
-    with pytest.raises(EnvironmentFailed, match="NaN or Inf in its observation after step 7"):
-        run.train(Config(**settings))
-    assert threading.active_count() == 1
     settings = {**SMALL, "out": str(tmp_path / "act"), "epochs": 1}
     with monkeypatch.context() as patch, pytest.raises(FloatingPointError, match="in the networks"):
         patch.setattr(EnsembleDDPG, "act", lambda self, *args: np.full((2, 8, 2), np.nan))
-        run.train(Config(**settings))
-    settings = {**SMALL, "env": "BrokenReward-v0", "out": str(tmp_path / "reward"), "epochs": 1}
-    with pytest.raises(EnvironmentFailed, match="its compute_reward gave nan"):
         run.train(Config(**settings))
     settings = {**SMALL, "out": str(tmp_path / "lr"), "epochs": 1, "learning_rate": 1e30}
     with pytest.raises(FloatingPointError, match="variance of the Q-values"):

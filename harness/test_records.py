@@ -27,7 +27,7 @@ import run
 from ensemble import EnsembleDDPG
 from harness import epoch, records
 from harness.assemble import restored
-from harness.errors import EnvironmentFailed, UsageError
+from harness.errors import UsageError
 from harness.records import read_rows
 from harness.testing import ARGUMENTS, SMALL, assert_same_run, finish, main, start
 from run import Config
@@ -49,10 +49,6 @@ def test_a_resumed_run_of_a_robot_equals_an_uninterrupted_one(tmp_path):
     for epochs, resume in ((1, False), (2, True)):
         run.train(Config(**settings, epochs=epochs, out=str(tmp_path / "parts")), resume)
     assert_same_run(tmp_path / "whole", tmp_path / "parts")
-    assert not multiprocessing.active_children() and threading.active_count() == 1
-    settings = {**settings, "env": "Broken-v0", "out": str(tmp_path / "broken")}
-    with pytest.raises(EnvironmentFailed):
-        run.train(Config(**settings))
     assert not multiprocessing.active_children() and threading.active_count() == 1
 
 

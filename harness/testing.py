@@ -234,25 +234,6 @@ class Line(gym.Env):
         return self.stepped(obs, reward, False, False, {"is_success": bool(reward == self.best)})
 
 
-class Broken(Line):
-    """Observes NaN in step 7, once it trains."""
-
-    def observe(self):
-        nan = math.nan if self.t == 7 and self.unseeded > 1 else 0
-        return {**super().observe(), "observation": self.x + nan}
-
-
-class BrokenReward(Line):
-    """Computes NaN for several goals, once it trains."""
-
-    def rewarded(self, rewards):
-        return rewards + (math.nan if rewards.ndim and self.unseeded > 1 else 0)
-
-
-gym.register("Broken-v0", Broken, max_episode_steps=10)
-gym.register("BrokenReward-v0", BrokenReward, max_episode_steps=10)
-
-
 def without_timing(folder):
     rows = read_rows(folder)
     return [{k: v for k, v in row.items() if not k.endswith("_seconds")} for row in rows]
