@@ -1,6 +1,5 @@
 """Tests of the settings and the schedule."""
 
-
 import pytest
 import torch
 
