@@ -162,7 +162,7 @@ class EnsembleDDPG:
     @torch.no_grad()
     def act(self, obs: np.ndarray, goal: np.ndarray, heads: slice = slice(None)) -> np.ndarray:
         """Algorithm 2, line 7, without noise: a = μ_k(s, g) for all heads in one call.
-        obs (n, E, O) and goal (n, E, G) -> (n, E, A) for the n heads that `heads` picks, else K.
+        obs (n, E, O) and goal (n, E, G) -> (n, E, A), for the n heads that `heads` picks or all K.
         ValueError for rows of another number of heads."""
         acting = len(range(self.num_heads)[heads])
         if not (np.ndim(obs) == np.ndim(goal) == 3 and len(obs) == len(goal) == acting):

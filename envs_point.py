@@ -78,9 +78,10 @@ class PointMass(gym.Env):
     """PointMassEmptyEnv-v1 and PointMassWallEnv-v1: a circle in a walled room moves to a point.
 
     Appendix A: observation and achieved goal are the circle's centre (x, y), the goal is the point,
-    the action is the distance moved. The released code: 0.05 per unit of it in each axis, success
-    within 0.05, a MuJoCo model with next to no inertia; this one has none, and needs no MuJoCo.
-    Start and goal are uniform over the places where the circle's centre can be (ours).
+    the action is the distance moved. From the released code: an action of 1 moves it by 0.05, in
+    each axis, and success is within 0.05. That code's MuJoCo model has next to no inertia; this one
+    has none, and needs no MuJoCo. Start and goal are uniform over the places where the circle's
+    centre can be (ours).
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}

@@ -89,7 +89,7 @@ def relabel_future(
     relabel_ratio: probability that a transition gets a new goal. HER's k = 4 additional goals
         (Appendix B) is the ratio k/(1+k) = 0.8; nothing is stored k times.
     reward_fn: Eq. (1), vectorised: (B, G) achieved and (B, G) desired goals -> (B,) of -1 and 0.
-    e, t: the episode and the step of each transition, (B,); else all are drawn alike.
+    e, t: the episode and the step of each transition, (B,); what is not given is drawn uniformly.
     Returns obs (B, O), action (B, A), next_obs (B, O), goal (B, G), reward (B,) and hindsight (B,),
         a bool.
     FloatingPointError for a reward that is NaN or Inf; ValueError for rewards of another shape or

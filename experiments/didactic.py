@@ -48,9 +48,9 @@ def trained(config: Config, epoch: int) -> Parts:
 def figure_3(config: Config) -> dict[str, np.ndarray]:
     """Section 5.3: the variance of a random state ŝ and its action with each achieved goal of its
     own trajectory, and the heads' mean value. xy (5, T+1, 2); t (5,), the step of ŝ; variance and
-    value (5, T+1). Section 5.4: both of all transitions of B_h, her_variance and her_value (N,).
+    value (5, T+1). Section 5.4: of all transitions of B_h, her_variance and her_value (N,).
 
-    The trajectories are those that move most among an episode of each head, with exploration."""
+    The trajectories are the five longest of one episode of each head, played with exploration."""
     parts = trained(config, EPOCH)
     agent, rng = parts.agent, np.random.default_rng(0)
 

@@ -46,6 +46,8 @@ def remark(text: str) -> None:
 
 def picture(frame: Any) -> np.ndarray:
     """A copy of what `render` gave, (height, width, 3) uint8. ValueError if it is no picture."""
+    if frame is None:
+        raise ValueError("no picture but None")
     frame = np.array(frame)
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size:
         raise ValueError(f"no picture (height, width, 3) of uint8 but {frame.shape} {frame.dtype}")
@@ -98,8 +100,12 @@ class Border(gym.Wrapper):
         for best in (0, 1):
             if rewards.shape == (3,) and rewards[0] == best and set(rewards) <= {best - 1, best}:
                 return float(rewards[0])
-        wanted = "its compute_reward must give -1 and 0 (reached), or 0 and 1, of many at once"
-        raise self.failed(f"{wanted}: of three, the first one reached, it gave {rewards.tolist()}")
+        wanted = (
+            "its compute_reward must give -1 and 0 (reached), or 0 and 1, of many pairs at once"
+        )
+        raise self.failed(
+            f"{wanted}: for three pairs, the first of them reached, it gave {rewards.tolist()}"
+        )
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """With a seed, Python's and NumPy's global generators get it too: some environments draw
@@ -236,7 +242,7 @@ def refuse_spaces(env: gym.Env, name: str) -> None:
     refuse(f"its actions are whole numbers ({action}), not real ones", whole)
     with np.errstate(over="ignore"):
         width = np.float32(action.high) - np.float32(action.low)
-    bounds = f"its actions need bounds that float32 tells apart ({action})"
+    bounds = f"its actions need bounds a finite width apart in float32 ({action})"
     refuse(bounds, not (np.isfinite(width) & (width > 0)).all())
     length = "it has no episode length; give one, such as --episode-length 50"
     refuse(length, env.spec.max_episode_steps is None)

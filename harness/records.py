@@ -95,6 +95,8 @@ def begin(folder: Path, config: dict, parts, resume: bool) -> list[dict]:
         write_config(folder, config)
     if rows:
         write_rows(folder, rows, config)
+    else:
+        (folder / "progress.csv").unlink(missing_ok=True)  # of a run whose config.json is gone
     return rows
 
 

@@ -43,10 +43,10 @@ class Config:
     epochs: int = setting(50, "epochs, M in Algorithm 2", least=1)
     cycles: int | None = setting(None, "collections an epoch, n (default: 5, 15 or 50)", least=1)
     updates: int | None = setting(
-        None, "updates of each head a cycle (default: 5 or 40, dtgsh: 160)", least=1
+        None, "updates of each head a cycle (default: 5 or 40; dtgsh: 5 or 160)", least=1
     )
     batch_size: int | None = setting(
-        None, "transitions in a head's mini-batch (default: 64 or 256, dtgsh: 64)", least=1
+        None, "transitions in a head's mini-batch (default: 64 or 256; dtgsh: 64)", least=1
     )
     episode_length: int | None = setting(
         None, "steps of an episode, T (default: 50, or the environment's own)", least=1
@@ -151,7 +151,7 @@ def scored_a_sweep(config: Config) -> int:
 
 def complete(config: Config) -> Config:
     """A copy with all that is None by default filled in, but for what the run's parts decide.
-    UsageError for a setting of the wrong type, out of range, or of another method."""
+    UsageError for a setting of the wrong type, out of range, of another method, or of no effect."""
     given = {name: value for name, value in asdict(config).items() if value is not None}
     for f in fields(Config):
         if f.name in given:

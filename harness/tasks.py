@@ -78,7 +78,12 @@ def make_env(
         gym.registry.setdefault(spec.id, spec)
     how = {"max_episode_steps": length, "disable_env_checker": True, **kwargs}
     with before_training():
-        env = asked(name, "constructor", gym.make, made, **how)
+        try:
+            env = asked(name, "creation", gym.make, made, **how)
+        except EnvironmentFailed as error:
+            module = sys.modules.get(made.rpartition(":")[0])  # which may be one of this project's
+            where = f"; the module is {module.__file__}" if module else ""
+            raise EnvironmentFailed(f"{error}{where}") from error
         asked(name, "spaces", refuse_spaces, env, name)
         box = env.action_space
         if not (np.all(box.low == -1) and np.all(box.high == 1)):
@@ -157,8 +162,11 @@ def _look_at_the_scale(env: Border, rows: list[dict]) -> None:
     numbers. The paper's own tasks, in which some numbers hardly move, are learned."""
     goals = np.array([row[key] for row in rows for key in ("achieved_goal", "desired_goal")])
     hardly_seen = f"beyond ±{CLIP} or by less than {FLOOR}, which the networks hardly see"
-    if np.abs(goals).max() > CLIP or 0 < np.std(goals, axis=0, dtype=np.float64).max() < FLOOR:
-        raise env.failed(f"its goals move {hardly_seen}: use other units")
+    largest = np.abs(goals).max()
+    if largest > CLIP or 0 < np.std(goals, axis=0, dtype=np.float64).max() < FLOOR:
+        raise env.failed(
+            f"its goals move {hardly_seen} (the largest is {largest:.3g}): use other units"
+        )
     if env.spec.id in PAPER_ENVS.values():
         return
     obs = np.array([row["observation"] for row in rows])

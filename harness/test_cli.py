@@ -117,6 +117,7 @@ BAD = [
     ("--env FetchReach-v2", "FetchReach-v4"),
     ("--env FetchReachDense-v4", "must give -1 and 0 (reached), or 0 and 1"),
     ("--env nowhere:Env-v0", "nowhere"),
+    ("--env her:Mine-v0", "the module is /"),  # this project's her.py, and not theirs
     ("--env=", "Malformed environment ID"),
     ("--method her --priority variance", "--priority goes with --method vcp"),
     ("--method her --importance none", "--importance goes with --method vcp"),

@@ -73,7 +73,7 @@ def python(program: str, folder: Path) -> str:
 
 
 def test_the_method_can_be_taken_out(tmp_path):
-    """vcp.py beside her.py and ensemble.py in an empty folder, with NumPy and PyTorch alone."""
+    """The three modules and the example, in an empty folder, with NumPy and PyTorch alone."""
     for name in ("vcp", "her", "ensemble", "examples/own_task"):
         shutil.copy(HERE / f"{name}.py", tmp_path)
     program = """

@@ -147,6 +147,13 @@ def test_a_full_disk_stops_the_run_and_keeps_the_last_epoch(whole, tmp_path):
     assert_same_run(whole, folder)
 
 
+def test_rows_that_a_deleted_run_left_are_not_this_runs(tmp_path):
+    (tmp_path / "progress.csv").write_text("epoch\n1\n")
+    with pytest.raises(FloatingPointError):
+        run.train(Config(**SMALL, epochs=1, learning_rate=1e30, out=str(tmp_path)))
+    assert records.epochs_done(tmp_path) == 0
+
+
 def test_networks_that_are_not_numbers_are_not_saved(tmp_path, monkeypatch):
     """NaN in the targets, which neither act nor have a loss before the next epoch."""
     config = Config(**{**SMALL, "cycles": 1}, epochs=1, out=str(tmp_path))
