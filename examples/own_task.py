@@ -1,4 +1,4 @@
-"""VCP on a task of your own, in Room's place, with vcp.py, her.py and ensemble.py beside it."""
+"""VCP on a task of your own: put it in Room's place. It needs vcp.py, her.py, ensemble.py."""
 
 import numpy as np
 

@@ -2,8 +2,9 @@
 
     python -m experiments.figures NAME [--runs DIR]
 
-reads config.json and progress.csv of every run below results/, or below DIR, and writes NAME.png
-there. For "summary" it writes each task's table and curves.png into <env>/, and a line a task into
+reads config.json and progress.csv of every run below results/, or below DIR (for fig3, fig5 and
+fig8 what experiments/didactic.py left there), and writes NAME.png there. "all" is all of them. For
+"summary" it writes each task's table and curves.png into <env>/, and a line a task into
 README.md. What a run is follows from its settings, whatever its folder is called.
 """
 
