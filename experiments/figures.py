@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from experiments import didactic
 from experiments.didactic import RESULTS
 from harness import settings
+from harness.errors import UsageError
 from harness.records import read_rows
 from harness.settings import Config
 
@@ -49,13 +50,15 @@ class Run:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """Every run below `folder`, those on a GPU last and else by seed."""
+    """Every run below `folder`, those on a GPU last and else by seed. UsageError for one of another
+    version."""
     runs = []
     for file in folder.rglob("progress.csv"):
-        ours = (file.parent / "config.json").exists()  # other programs write a progress.csv too
-        if ours and (rows := read_rows(file.parent)):
+        if not (file.parent / "config.json").exists():  # other programs write a progress.csv too
+            continue
+        saved = settings.load(file.parent)
+        if rows := read_rows(file.parent):
             columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-            saved = settings.load(file.parent)
             config = settings.complete(replace(saved, device="cpu"))
             runs.append(Run(config, saved.device == "cuda", columns))
     return sorted(runs, key=lambda run: (run.gpu, run.config.seed, run.config.out))
@@ -395,6 +398,8 @@ def main() -> None:
     for name in NAMES if given.name == "all" else [given.name]:
         try:
             print(draw(name, given.runs))
+        except UsageError as error:
+            parser.error(str(error))
         except SystemExit as missing:  # the others can be drawn
             if given.name != "all":
                 raise

@@ -118,9 +118,13 @@ def test_ones_own_runs_are_drawn(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "FetchReach-v1" / "curves.png").exists()
     for name in ("fig3.npz is missing", "fig5", "fig6 compares runs that are not in", "fig9"):
         assert name in err
-    monkeypatch.setattr(sys, "argv", ["figures", "all", "--runs", str(tmp_path / "nowhere")])
-    with pytest.raises(SystemExit):
-        figures.main()
+    (tmp_path / "another" / "config.json").write_text('{"config": {"lr": 1}}')
+    for wrong in ("another", "nowhere"):
+        monkeypatch.setattr(sys, "argv", ["figures", "all", "--runs", str(tmp_path / wrong)])
+        with pytest.raises(SystemExit):
+            figures.main()
+        err = capsys.readouterr().err
+        assert err.count("error: ") == 1 and str(tmp_path / wrong) in err
 
 
 def test_the_label_names_what_is_not_the_default():
